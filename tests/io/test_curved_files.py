@@ -54,12 +54,13 @@ def test_surfaces_are_loaded_as_they_were_saved(flat, make, tmp_path):
         assert eqx.tree_equal(frame, tissue)
 
 
-def test_a_trajectory_with_several_surfaces_is_rejected(flat, tmp_path):
+def test_a_trajectory_may_have_several_surfaces(flat, tmp_path):
     trajectory = vx.mesh.Trajectory()
     for height in (1.0, 2.0):
         trajectory.append(flat.with_surface(HeightMap(height * HEIGHTS, SIDE / 6, periodic=True)))
-    with pytest.raises(ValueError, match="one surface"):
-        vx.io.save_trajectory(tmp_path / "run.npz", trajectory)
+    vx.io.save_trajectory(tmp_path / "run.npz", trajectory)
+    for loaded, frame in zip(vx.io.load_trajectory(tmp_path / "run.npz"), trajectory, strict=True):
+        assert eqx.tree_equal(loaded, frame)
 
 
 def test_problems_keep_the_surface_of_their_tissue(tube, tmp_path):
@@ -71,7 +72,7 @@ def test_problems_keep_the_surface_of_their_tissue(tube, tmp_path):
 
 
 def test_a_function_has_no_place_in_a_file(flat, tmp_path):
-    with pytest.raises(ValueError, match="no surface of class Graph"):
+    with pytest.raises(ValueError, match=r"`surface\.function` is of type"):
         vx.save_tissue(tmp_path / "tissue.npz", flat.with_surface(Graph(lambda x: 0 * x[0])))
 
 
@@ -79,9 +80,8 @@ def test_a_broken_surface_is_rejected(tube, tmp_path):
     vx.save_tissue(tmp_path / "tissue.npz", tube)
     arrays = dict(np.load(tmp_path / "tissue.npz"))
     for changes, message in (
-        ({"surface": np.asarray("torus")}, "unknown kind"),
-        ({"surface_radius": np.ones(2)}, "surface_radius"),
-        ({"surface_radius": np.asarray(1.0)}, "period"),
+        ({"data.surface.radius": np.ones(2)}, "surface"),
+        ({"data.surface.radius": np.asarray(1.0)}, "period"),
     ):
         np.savez(tmp_path / "broken.npz", allow_pickle=False, **(arrays | changes))
         with pytest.raises(ValueError, match=message):

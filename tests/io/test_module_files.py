@@ -297,9 +297,11 @@ class TestRefusedToSave:
             save_energy(path, Anything(AtRest()))
 
     def test_something_else(self, path, tissues):
-        with pytest.raises(TypeError, match="`energy` must be an AbstractEnergy, but is Tissue"):
+        with pytest.raises(
+            TypeError, match="class AbstractEnergy, but is an object of type Tissue"
+        ):
             save_module(path, "energy", tissues["free"], vx.AbstractEnergy)
-        with pytest.raises(TypeError, match="`problem` must be an InverseProblem"):
+        with pytest.raises(TypeError, match="`problem` must be of class InverseProblem"):
             save_module(path, "problem", ENERGIES["arrays"], vx.InverseProblem)
 
     def test_the_remedies_work(self, path, tissues):
@@ -409,9 +411,12 @@ class TestRefusedToLoad:
             ({"tree": None}, "`tree` cannot be read"),
             ({"tree": "{"}, "`tree` cannot be read"),
             ({"tree": "[" * 100_000}, "`tree` cannot be read"),
-            ({"tree": "3"}, "must hold an AbstractEnergy, but holds int"),
+            ({"tree": "3"}, "must hold a module of class AbstractEnergy, but .* int"),
             ({"tree": '{"kind": "set", "items": []}'}, "not one of the things"),
-            ({"tree": '{"kind": "vertax", "class": "Free", "fields": {}}'}, "but holds Free"),
+            (
+                {"tree": '{"kind": "vertax", "class": "Free", "fields": {}}'},
+                "but holds one of class Free",
+            ),
             ({"data.terms.0.tension": None}, r"no array `data\.terms\.0\.tension`"),
             ({"version": 0}, "broken header"),
         ],
@@ -429,7 +434,9 @@ class TestRefusedToLoad:
             load_problem(path)
         save_problem(path, problem_of(tissues["periodic"]))
         rewritten(path, **{"data.tissue.vertices": np.zeros((3, 2))})
-        with pytest.raises(ValueError, match=r"`problem\.tissue`: `vertices` has shape \(3, 2\)"):
+        with pytest.raises(
+            ValueError, match=r"`problem\.tissue`: .*`vertices` must have shape \(16, 2\)"
+        ):
             load_problem(path)
 
 

@@ -20,7 +20,7 @@ LINES = {
     "growth": 775,
     "inference": 2180,
     "initialise": 4001,
-    "io": 4000,
+    "io": 3777,
     "jobs": 935,
     "mechanics": 2216,
     "mesh": 2908,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2319,
     "surfaces": 630,
     "tensions": 4361,
-    "tests": 31757,
+    "tests": 31753,
     "transitions": 1333,
 }
 # Largest number of lines of a file, and of the files that have more.
@@ -43,7 +43,7 @@ LONG_FILES = {
     "growth/_grow.py": 406,
     "initialise/_labels.py": 502,
     "initialise/_polygons.py": 595,
-    "io/_module_file.py": 448,
+    "io/_module_file.py": 444,
     "mesh/_tissue.py": 623,
     "mesh/_topology.py": 421,
     "solvers/_minres.py": 438,

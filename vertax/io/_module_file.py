@@ -1,9 +1,10 @@
-"""Files of energies and inverse problems: a tree of class names and fields, and the arrays."""
+"""Files of tissues, energies and inverse problems: a tree of class names and fields, and the arrays."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import inspect
 import json
 import math
@@ -17,19 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from vertax import (
-    activities,
-    adjoints,
-    costs,
-    dissipations,
-    dynamics,
-    energies,
-    external,
-    mechanics,
-    relax,
-    solvers,
-    surfaces,
-)
 from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax._base.checks import describe
 from vertax.energies import AbstractEnergy
@@ -51,6 +39,11 @@ _FUNCTIONS: dict[str, Callable] = {
     "optimistix.rms_norm": optx.rms_norm,
     "optimistix.two_norm": optx.two_norm,
 }
+# Packages with classes that a file may hold.
+_FAMILIES = (
+    *("activities", "adjoints", "costs", "dissipations", "dynamics", "energies", "external"),
+    *("mechanics", "relax", "solvers", "surfaces"),
+)
 _ODD_FLOATS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -167,7 +160,7 @@ def save_module(
     """
     if not isinstance(module, kind):
         raise TypeError(
-            f"Argument `{what}` must be an {kind.__name__}, but is {type(module).__name__}."
+            f"Argument `{what}` must be of class {kind.__name__}, but is {describe(module)}."
         )
     writer = _Writer(what, classes)
     tree = json.dumps(writer.node(module, ""), allow_nan=False)
@@ -206,7 +199,8 @@ def load_module(
         raise ValueError(f"{name} is broken: its `tree` cannot be read ({error}).") from error
     if not isinstance(module, kind):
         raise ValueError(
-            f"{name} is broken: it must hold an {kind.__name__}, but holds {type(module).__name__}."
+            f"{name} is broken: it must hold a module of class {kind.__name__}, but holds one of class "
+            f"{type(module).__name__}."
         )
     return module
 
@@ -216,27 +210,14 @@ def _public_classes() -> dict[str, type[eqx.Module]]:
     """The classes of vertax by their names in files."""
     single = (Arcs, Free, InTurn, InverseProblem, Periodic, T1, T2, Tissue, Topology)
     classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
-    families = (
-        activities,
-        adjoints,
-        costs,
-        dissipations,
-        dynamics,
-        energies,
-        external,
-        mechanics,
-        relax,
-        solvers,
-        surfaces,
-    )
-    for family in families:
-        for name, cls in vars(family).items():
+    for family in _FAMILIES:
+        for name, cls in vars(importlib.import_module(f"vertax.{family}")).items():
             if (
                 isinstance(cls, type)
                 and issubclass(cls, eqx.Module)
                 and not inspect.isabstract(cls)
             ):
-                classes[f"{family.__name__.removeprefix('vertax.')}.{name}"] = cls
+                classes[f"{family}.{name}"] = cls
     return classes
 
 
@@ -425,15 +406,33 @@ class _Reader:
         # In a batch, and in a tree of booleans (`trainable`), there is no single tissue.
         try:
             if isinstance(module, Topology) and np.ndim(module.twin) == 1:
+                if any(x.dtype != np.int32 for x in jax.tree.leaves(module)):
+                    raise ValueError("the arrays of its topology are not of type int32")
                 module.validate()
+            if isinstance(module, Periodic) and np.ndim(module.lattice) == 2:
+                Periodic(module.lattice)
             if isinstance(module, Tissue) and np.ndim(module.vertices) == 2:
-                expected = (module.topology.n_vertices, 2)
-                if module.vertices.shape != expected:
-                    raise ValueError(
-                        f"`vertices` has shape {module.vertices.shape}, but must have {expected}."
-                    )
+                check_tissue(module)
         except Exception as error:
             raise ValueError(f"{self.file} is broken: `{path}`: {error}") from error
+
+
+def check_tissue(tissue: Tissue) -> None:
+    """Raise a `ValueError` for a tissue that its constructor would refuse or change."""
+    again = Tissue(
+        tissue.vertices,
+        tissue.topology,
+        tissue.boundary,
+        tissue.softening,
+        angles=tissue.angles,
+        inner_arcs=tissue.inner_arcs,
+        pinned=tissue.pinned,
+        angle_length=tissue.angle_length,
+        surface=tissue.surface,
+    )
+    for given, right in zip(*map(jax.tree.leaves, (tissue, again)), strict=True):
+        if eqx.is_array(given) and (given.shape, given.dtype) != (right.shape, right.dtype):
+            raise ValueError("the shapes or types of its arrays are not those of a tissue")
 
 
 def _weakly_typed(array: jax.Array) -> jax.Array:

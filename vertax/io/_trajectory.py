@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
+from itertools import groupby
 
 import equinox as eqx
+import jax
 import numpy as np
 
-from vertax._base.archive import read_archive, write_archive
-from vertax.io._tissue_file import tissue_arrays, tissue_from
-from vertax.mesh import Topology, Trajectory
+from vertax._base.archive import as_jax
+from vertax.io._module_file import check_tissue, load_module, save_module
+from vertax.mesh import Tissue, Trajectory
 
-_VERSION = 1
-_TOPOLOGY = ("twin", "cell", "frame", "edge", "half_edge")
-_ONCE = ("boundary", "inner_arcs", "spare")
+
+class _Frames(eqx.Module):
+    """The frames of a trajectory."""
+
+    parts: list[Tissue]
+    """Successive frames of one topology, with a first axis for the frames in all other arrays."""
+    values: dict[str, np.ndarray]
 
 
 def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     """Save a trajectory to a file, exactly.
 
-    The file is a NumPy `.npz` archive without pickles. Its arrays are those of
-    [`save_tissue`][vertax.io.save_tissue] with a first axis for the frames; those of the topology
-    have a first axis for the distinct topologies, and `topology` is the number of that of each frame. Values
-    are stored as `value_…`. It is written atomically.
+    The format is that of [`save_energy`][vertax.io.save_energy]: successive frames of one topology are one
+    batch of tissues, `data.parts.0` and so on, and the values are `data.values.0` and so on.
 
     **Arguments:**
 
@@ -31,83 +36,66 @@ def save_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> Non
 
     **Raises:**
 
-    - `ValueError` if there is no frame, if frames have different surfaces, and as
-        [`save_tissue`][vertax.io.save_tissue].
+    - `ValueError` if there is no frame, and as [`save_tissue`][vertax.io.save_tissue].
     - `OSError` if the file cannot be written.
     """
     if len(trajectory) == 0:
         raise ValueError("Argument `trajectory` must have at least one frame, but is empty.")
-    tissues = list(trajectory)
-    frames = [tissue_arrays(tissue) for tissue in tissues]
-    topologies = [tissue.topology for tissue in tissues]
-    new = [
-        i
-        for i, topology in enumerate(topologies)
-        if i == 0 or not eqx.tree_equal(topology, topologies[i - 1])
+    # (Successive frames of one topology share its arrays.)
+    parts = [
+        _stacked([*run]) for _, run in groupby(trajectory._frames, lambda t: id(t.topology.twin))
     ]
-    number = np.cumsum(np.isin(np.arange(len(frames)), new)) - 1
-    arrays = {"topology": number}
-    surfaces = [tissue.surface for tissue in tissues]
-    if not all(eqx.tree_equal(surface, surfaces[0]) for surface in surfaces):
-        raise ValueError(
-            "Argument `trajectory` must have one surface to be saved, but it differs between frames. Save "
-            "the frames one by one with save_tissue."
-        )
-    for name in frames[0]:
-        if _is_stored_once(name):
-            arrays[name] = frames[0][name]
-        else:
-            chosen = [frames[i] for i in new] if name in _TOPOLOGY else frames
-            arrays[name] = np.stack([frame[name] for frame in chosen])
-    arrays |= {f"value_{name}": values for name, values in trajectory.values.items()}
-    write_archive(path, "trajectory", _VERSION, arrays)
+    save_module(path, "trajectory", _Frames(parts, trajectory.values), _Frames, [_Frames])
 
 
-def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+def load_trajectory(
+    path: str | os.PathLike[str], *, classes: Iterable[type[eqx.Module]] = ()
+) -> Trajectory:
     """Load a trajectory that [`save_trajectory`][vertax.io.save_trajectory] wrote.
 
     **Arguments:**
 
     - `path`: the file.
+    - `classes`: as of [`load_tissue`][vertax.io.load_tissue].
 
     **Returns:** the trajectory, each frame bit for bit as it was saved.
 
-    **Raises:**
-
-    - `FileNotFoundError` if there is no such file.
-    - `ValueError`, with the file's name, if it is not a trajectory file or is broken, as
-        [`load_tissue`][vertax.io.load_tissue].
+    **Raises:** as [`load_tissue`][vertax.io.load_tissue].
     """
     name = os.fspath(path)
-    arrays = read_archive(path, "trajectory", _VERSION)
-    number = arrays.pop("topology", np.zeros(()))
-    if number.ndim != 1 or number.dtype.kind != "i" or len(number) == 0:
-        raise ValueError(f"{name} is broken: `topology` must number the topologies of the frames.")
-    values = {key: arrays.pop(key) for key in [*arrays] if key.startswith("value_")}
-    once = {key: a for key, a in arrays.items() if _is_stored_once(key)}
-    framed = {key: a for key, a in arrays.items() if key not in (*once, "format", "version")}
-    for key, array in (framed | values).items():
-        n = number.max() + 1 if key in _TOPOLOGY else len(number)
-        if array.ndim == 0 or len(array) != n:
-            raise ValueError(
-                f"{name} is broken: `{key}` has shape {array.shape}, but must have {n} entries."
-            )
-    if number.min() < 0 or any(array.shape[:1] != number.shape for array in values.values()):
-        raise ValueError(f"{name} is broken: `topology` or the values do not match the frames.")
-    topologies: dict[int, Topology] = {}
+    held = load_module(path, "trajectory", _Frames, [_Frames, *classes])
     trajectory = Trajectory()
-    for i, k in enumerate(number.tolist()):
-        frame = {
-            key: np.asarray(array[k if key in _TOPOLOGY else i]) for key, array in framed.items()
-        }
-        tissue = tissue_from(once | frame, name, topologies.get(k))
-        topologies.setdefault(k, tissue.topology)
-        trajectory.append(
-            tissue, **{key.removeprefix("value_"): column[i] for key, column in values.items()}
-        )
+    try:
+        parts = jax.tree.map(lambda x: as_jax(x, name), held.parts)
+        frames = [frame for part in parts for frame in _members(part)]
+        for frame in frames:
+            check_tissue(frame)
+        for k, frame in enumerate(frames):
+            trajectory.append(frame, **{key: column[k] for key, column in held.values.items()})
+        if any(len(column) != len(frames) for column in held.values.values()):
+            raise ValueError(f"its values are not those of {len(frames)} frames")
+    except Exception as error:  # of NumPy and JAX, for arrays that do not fit
+        raise ValueError(f"{name} is broken: {error}") from error
     return trajectory
 
 
-def _is_stored_once(name: str) -> bool:
-    """Whether an array is the same in all frames."""
-    return name in _ONCE or name.startswith("surface")
+def _stacked(frames: list[Tissue]) -> Tissue:
+    arrays = jax.tree.map(lambda *x: np.stack(x), *map(_without_topology, frames))
+    return _with_topology(arrays, frames[0])
+
+
+def _members(part: Tissue) -> list[Tissue]:
+    rest = _without_topology(part)
+    return [
+        _with_topology(jax.tree.map(lambda x, k=k: x[k], rest), part)
+        for k in range(len(part.vertices))
+    ]
+
+
+def _without_topology(tissue: Tissue) -> Tissue:
+    return eqx.tree_at(lambda t: t.topology, tissue, None)
+
+
+def _with_topology(tissue: Tissue, other: Tissue) -> Tissue:
+    nothing = lambda x: x is None
+    return eqx.tree_at(lambda t: t.topology, tissue, other.topology, is_leaf=nothing)
