@@ -84,8 +84,10 @@ def test_sense_of_rotation_and_first_corner_do_not_matter(flipped, shift):
     np.testing.assert_array_equal(ends, np.sort(sides, axis=1))
 
 
-def test_sides_take_the_shortest_way_through_a_periodic_box():
-    tissue = vx.initialise.periodic_voronoi(40, key=0, lattice=np.array([[6.0, 0.0], [2.5, 7.0]]))
+# A cell of the other tissue has a side longer than half the box.
+@pytest.mark.parametrize(("n", "lattice"), [(40, [[6.0, 0.0], [2.5, 7.0]]), (9, 3 * np.eye(2))])
+def test_sides_take_the_shortest_way_through_a_periodic_box(n, lattice):
+    tissue = vx.initialise.periodic_voronoi(n, key=3, lattice=np.array(lattice))
     result = vx.initialise.from_polygons(
         tissue.vertices, corners_of(tissue)[0], box=tissue.boundary.lattice
     )

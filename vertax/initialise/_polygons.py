@@ -93,8 +93,8 @@ def from_polygons(
     - `box`: of a periodic tissue, width and height, or two lattice vectors as rows, shape `(2, 2)`. Points
         may lie outside the box. Without it the tissue is free.
     - `images`: of a periodic tissue, for each cell, integers of shape `(corners, 2)`: its corner k is at
-        `points[cell[k]] + images[k] @ lattice`. By default each side takes the shortest way, which is
-        right where all sides are shorter than half the box.
+        `points[cell[k]] + images[k] @ lattice`. By default each side takes the shortest way that closes the
+        outline, which is right where at most one side of a cell is longer than half the box.
     - `tolerance`: points closer together than this are one, the first of them; a point closer than this to a
         side of another cell is a corner of that cell too. In units of length; smaller than the sides of the
         cells. By default points are what `cells` says.
@@ -459,10 +459,7 @@ def corner_images(
     if lattice is None:
         arrays = [np.zeros((len(corner), 2), int) for corner in corners]
     elif images is None:
-        arrays = [
-            _nearest_images(position[corner], lattice, names.cell(cell), names)
-            for cell, corner in enumerate(corners)
-        ]
+        arrays = [_nearest_images(position[corner], lattice) for corner in corners]
     else:
         arrays = [np.asarray(image) for image in images]
         shapes = [(len(corner), 2) for corner in corners]
@@ -493,10 +490,8 @@ def corner_images(
 def _nearest_images(
     polygon: Float[np.ndarray, "corners 2"],
     lattice: Float[np.ndarray, "2 2"],
-    cell: str,
-    names: Names,
 ) -> Int[np.ndarray, "corners 2"]:
-    """Images of the corners of a cell, such that each side takes the shortest way."""
+    """Images of the corners of a cell: its sides take the shortest way, and its outline is closed."""
     side = np.roll(polygon, -1, axis=0) - polygon
     near = -np.rint(side @ np.linalg.inv(lattice))
     # In a leaning box a neighbour of the image in the parallelogram around 0 may be closer.
@@ -505,12 +500,10 @@ def _nearest_images(
     length = np.linalg.norm(side[:, None] + choices @ lattice, axis=-1)
     best = np.argmin(length - 1e-9 * np.all(steps == 0, axis=1) * np.max(length), axis=1)
     step = choices[np.arange(len(side)), best].astype(int)
-    if step.sum(axis=0).any():
-        names.refuse(
-            "have closed outlines whose sides are shorter than half the box",
-            f"{cell} leads from one image of its first corner to another",
-            "Give the `images` of the corners.",
-        )
+    if (gap := step.sum(axis=0)).any():
+        # A side is longer than half the box: that with the least detour by the image that closes the outline.
+        detour = np.linalg.norm(side + (step - gap) @ lattice, axis=1) - np.min(length, axis=1)
+        step[np.argmin(detour)] -= gap
     return np.cumsum(step, axis=0) - step
 
 
