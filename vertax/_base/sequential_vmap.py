@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 from jax.extend.core import jaxpr_as_fun
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 Result = TypeVar("Result")
 
@@ -52,11 +52,11 @@ def _mapped(program: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
     mapped = jax.custom_batching.custom_vmap(lambda *leaves: tuple(program(*leaves)))
 
     @mapped.def_vmap
-    def _(size: int, batched: list[bool], *leaves: Array) -> tuple[Any, Any]:
+    def _(size: int, batched: list[bool], *leaves: ArrayLike) -> tuple[Any, Any]:
         if _platform() == "cpu":
             members = [x for x, is_batched in zip(leaves, batched, strict=True) if is_batched]
 
-            def one(members: list[Array]) -> Any:
+            def one(members: list[ArrayLike]) -> Any:
                 rest = iter(members)
                 # `mapped`, so that a nested `vmap` is a loop too.
                 pairs = zip(leaves, batched, strict=True)
