@@ -224,7 +224,7 @@ def test_another_number_compiles_nothing():
         return vx.equilibrate(tissue, ShapeFactorEnergy(p0), adjoint=adjoint, **settings)
 
     compiled = []
-    relax(3.7, 1e-8, 1000, 0.02)
+    assert relax(3.7, 1e-8, 1000, 0.02).converged
     with counted_compilations(compiled):
         assert relax(3.71, 1e-9, 1001, 0.03).converged
         assert relax(3.72, 1e-7, 500, 0.01).converged
