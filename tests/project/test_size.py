@@ -7,7 +7,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 # Largest numbers of lines of Python, with comments and docstrings.
 LINES = {
-    "_base": 2922,
+    "_base": 2920,
     "activities": 436,
     "adjoints": 993,
     "bayes": 1090,

@@ -26,10 +26,7 @@ def fingerprint(function: Callable[..., Any], *args: Any) -> str:
     - `args`: its arguments. Their arrays are variables; the numbers in them are not part of the hash.
     """
     arrays, static = eqx.partition(args, eqx.is_array)
-
-    def of_arrays(arrays: Any) -> Any:
-        return eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array)
-
+    of_arrays = lambda arrays: eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array)
     return _hash(jax.make_jaxpr(of_arrays)(arrays), {})
 
 
@@ -60,7 +57,8 @@ def _lines(jaxpr: Jaxpr, visited: dict[int, str]) -> list[str]:
             return _hash(x.val, visited)
         return f"{numbers.setdefault(x, len(numbers))}:{x.aval}"
 
-    lines = [" ".join(map(atom, (*jaxpr.constvars, *jaxpr.invars)))]
+    lines = [_hash(list(getattr(jaxpr, "consts", [])), visited)]  # (since JAX 0.12)
+    lines += [" ".join(map(atom, (*jaxpr.constvars, *jaxpr.invars)))]
     for equation in jaxpr.eqns:
         parameters = {k: v for k, v in equation.params.items() if k != "name"}
         ends = [atom(x) for x in (*equation.invars, *equation.outvars)]
