@@ -9,11 +9,7 @@ from vertax.initialise import from_labels
 
 @pytest.mark.parametrize(
     "boundary",
-    [
-        "free",
-        pytest.param("periodic", marks=pytest.mark.thorough),
-        pytest.param("mirrored", marks=pytest.mark.thorough),
-    ],
+    ["free", *(pytest.param(b, marks=pytest.mark.thorough) for b in ("periodic", "mirrored"))],
 )
 def test_arcs_of_all_edges_hold_the_areas_of_the_pixels(boundary):
     labels = rasterise(clear_seeds(20, SHAPE, 1), SHAPE, periodic=boundary == "periodic")

@@ -5,15 +5,12 @@ from brute_force_overlaps import faces_that_overlap
 
 import vertax as vx
 
+THOROUGH = [
+    pytest.param({k: True}, marks=pytest.mark.thorough) for k in ("random_angles", "inner_arcs")
+]
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        pytest.param({"random_angles": True}, marks=pytest.mark.thorough),
-        pytest.param({"inner_arcs": True}, marks=pytest.mark.thorough),
-    ],
-)
+
+@pytest.mark.parametrize("options", [{}, *THOROUGH])
 def test_free_clusters_have_no_overlaps(options):
     # With these seeds, arcs that preserve the cell areas cross before the repair.
     for seed in (6, 7, 19, 28):

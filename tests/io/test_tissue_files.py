@@ -17,6 +17,10 @@ from vertax.io import load_tissue, save_tissue
 from vertax.mesh._topology import flip_edges
 
 
+def zeros(shape):
+    return np.zeros(shape, np.int32)
+
+
 @pytest.fixture(scope="module")
 def tissue():
     lattice = np.array([[4.0, 0.1], [1.3, 3.7]])
@@ -170,22 +174,13 @@ class TestRefusedToLoad:
             ({"boundary.lattice": None}, "no array `data.boundary.lattice`"),
             ({"vertices": np.zeros((3, 2))}, r"`vertices` must have shape \(22, 2\).*\(3, 2\)"),
             ({"topology.twin": np.zeros(66)}, "type int32"),
-            ({"topology.frame": np.zeros((66, 3), np.int32)}, "`frame` must have two entries"),
+            ({"topology.frame": zeros((66, 3))}, "`frame` must have two entries"),
             ({"boundary.lattice": np.eye(3)}, r"`lattice`.*\(2, 2\)"),
             ({"vertices": np.zeros((22, 2), int)}, "shapes or types"),
             # The classes of mesh and box raise; the file's name precedes their message.
-            (
-                {"topology.twin": np.zeros(66, np.int32)},
-                "is broken: .*`twin` must be an involution",
-            ),
-            (
-                {"topology.cell": np.zeros(66, np.int32)},
-                "is broken: .*every cell must have half-edges",
-            ),
-            (
-                {"topology.half_edge": np.zeros(33, np.int32)},
-                "`half_edge` must point into its edge",
-            ),
+            ({"topology.twin": zeros(66)}, "is broken: .*`twin` must be an involution"),
+            ({"topology.cell": zeros(66)}, "is broken: .*every cell must have half-edges"),
+            ({"topology.half_edge": zeros(33)}, "`half_edge` must point into its edge"),
             ({"boundary.lattice": -np.eye(2)[::-1]}, "right-handed"),
             ({"vertices": np.full((22, 2), np.nan)}, "must be finite"),
             ({"softening": np.array(-1.0)}, "`softening` must be at least 0"),

@@ -312,14 +312,12 @@ class TestFile:
         *_, trajectory = relaxation
         save_trajectory(path, trajectory)
         with np.load(path) as archive:
-            vertices, twin = (
-                archive[f"data.parts.0.{name}"].copy() for name in ("vertices", "topology.twin")
-            )
-        vertices[-1, 3], twin[-1] = np.nan, 0
-        rewritten(path, **{"data.parts.0.vertices": vertices})
-        with pytest.raises(ValueError, match=r"trajectory\.npz is broken: .*must be finite"):
-            load_trajectory(path)
-        save_trajectory(path, trajectory)
-        rewritten(path, **{"data.parts.0.topology.twin": twin})
-        with pytest.raises(ValueError, match=r"trajectory\.npz is broken: .*involution"):
-            load_trajectory(path)
+            names = ("vertices", "topology.twin", "boundary.lattice")
+            vertices, twin, lattice = (archive[f"data.parts.0.{name}"].copy() for name in names)
+        vertices[-1, 3], twin[-1], lattice[-1] = np.nan, 0, -lattice[-1, ::-1]
+        reasons = ("must be finite", "involution", "right-handed")
+        for name, array, reason in zip(names, (vertices, twin, lattice), reasons, strict=True):
+            save_trajectory(path, trajectory)
+            rewritten(path, **{f"data.parts.0.{name}": array})
+            with pytest.raises(ValueError, match=rf"trajectory\.npz is broken: .*{reason}"):
+                load_trajectory(path)

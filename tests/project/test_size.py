@@ -20,7 +20,7 @@ LINES = {
     "growth": 775,
     "inference": 2180,
     "initialise": 3994,
-    "io": 3777,
+    "io": 3771,
     "jobs": 935,
     "mechanics": 2216,
     "mesh": 2908,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2319,
     "surfaces": 630,
     "tensions": 4361,
-    "tests": 31753,
+    "tests": 31750,
     "transitions": 1333,
 }
 # Largest number of lines of a file, and of the files that have more.

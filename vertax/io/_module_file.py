@@ -409,8 +409,6 @@ class _Reader:
                 if any(x.dtype != np.int32 for x in jax.tree.leaves(module)):
                     raise ValueError("the arrays of its topology are not of type int32")
                 module.validate()
-            if isinstance(module, Periodic) and np.ndim(module.lattice) == 2:
-                Periodic(module.lattice)
             if isinstance(module, Tissue) and np.ndim(module.vertices) == 2:
                 check_tissue(module)
         except Exception as error:
@@ -418,7 +416,9 @@ class _Reader:
 
 
 def check_tissue(tissue: Tissue) -> None:
-    """Raise a `ValueError` for a tissue that its constructor would refuse or change."""
+    """Raise a `ValueError` for a tissue that its constructor, or that of its box, would refuse or change."""
+    if isinstance(tissue.boundary, Periodic):
+        Periodic(tissue.boundary.lattice)
     again = Tissue(
         tissue.vertices,
         tissue.topology,

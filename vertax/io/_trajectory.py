@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from itertools import groupby
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 
 from vertax._base.archive import as_jax
 from vertax.io._module_file import check_tissue, load_module, save_module
-from vertax.mesh import Tissue, Trajectory
+from vertax.mesh import Tissue, Topology, Trajectory
 
 
 class _Frames(eqx.Module):
@@ -79,23 +80,16 @@ def load_trajectory(
     return trajectory
 
 
+def _is_topology(x: Any) -> bool:
+    return isinstance(x, Topology)
+
+
 def _stacked(frames: list[Tissue]) -> Tissue:
-    arrays = jax.tree.map(lambda *x: np.stack(x), *map(_without_topology, frames))
-    return _with_topology(arrays, frames[0])
+    merge = lambda first, *others: first if _is_topology(first) else np.stack([first, *others])
+    return jax.tree.map(merge, *frames, is_leaf=_is_topology)
 
 
 def _members(part: Tissue) -> list[Tissue]:
-    rest = _without_topology(part)
-    return [
-        _with_topology(jax.tree.map(lambda x, k=k: x[k], rest), part)
-        for k in range(len(part.vertices))
-    ]
-
-
-def _without_topology(tissue: Tissue) -> Tissue:
-    return eqx.tree_at(lambda t: t.topology, tissue, None)
-
-
-def _with_topology(tissue: Tissue, other: Tissue) -> Tissue:
-    nothing = lambda x: x is None
-    return eqx.tree_at(lambda t: t.topology, tissue, other.topology, is_leaf=nothing)
+    take = lambda x, k: x if _is_topology(x) else x[k]
+    each = lambda k: jax.tree.map(lambda x: take(x, k), part, is_leaf=_is_topology)
+    return [each(k) for k in range(len(part.vertices))]

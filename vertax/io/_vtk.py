@@ -98,9 +98,9 @@ def _cell_blocks(polygons: list[Float[np.ndarray, "_ 2"]]) -> list[_Block]:
     """Convex cells as polygons and others as triangles, with global corner numbers."""
     elements, first = [], 0
     for row, polygon in enumerate(polygons):
-        polygon_corners = np.arange(len(polygon))[None]
-        one = is_convex(polygon)
-        kind, corners = ("polygon", polygon_corners) if one else ("triangle", triangulate(polygon))
+        kind, corners = "polygon", np.arange(len(polygon))[None]
+        if not is_convex(polygon):
+            kind, corners = "triangle", triangulate(polygon)
         elements += [(kind, first + each, row) for each in corners]
         first += len(polygon)
     # Successive elements of one kind and size share a block, so the order of the cells stays.
