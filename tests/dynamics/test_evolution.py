@@ -147,7 +147,7 @@ class TestWithoutActivity:
         batch = vx.fitting.stack([movie, movie])
         self.check_messages_of_failures(movie)
         np.testing.assert_array_equal(batch.flipped, jnp.stack([movie.flipped] * 2))
-        with pytest.raises(ValueError, match="a batch of"):
+        with pytest.raises(ValueError, match="one of a batch"):
             _ = batch.trajectory
 
 

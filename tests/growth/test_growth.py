@@ -56,6 +56,36 @@ def test_cells_divide_and_the_tissue_stays_valid(grown):
 
 
 @pytest.mark.thorough
+def test_a_growth_with_a_checkpoint_continues(tmp_path):
+    """One function, frame by frame, and a shorter run that is continued give the same growth."""
+
+    def run(n, **settings):
+        cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 4, 6)[:n]
+        return grow(
+            founders(), energy_of, cycle, times, key=1, relaxation=FIXED_TOPOLOGY, **settings
+        )
+
+    file = tmp_path / "growth.npz"
+    at_once, _ = run(6), run(3, checkpoint=file)
+    continued = run(6, checkpoint=file)
+    assert at_once.n_alive[2] < at_once.n_alive[-1]
+    np.testing.assert_array_equal(at_once.number, continued.number)
+    np.testing.assert_array_equal(at_once.lineage.mother, continued.lineage.mother)
+    np.testing.assert_allclose(at_once.frames.vertices, continued.frames.vertices, atol=1e-7)
+    np.testing.assert_allclose(at_once.cells_then.age, continued.cells_then.age, atol=1e-12)
+    with pytest.raises(ValueError, match="checkpoint of a growth with another tissue, energy or"):
+        grow(
+            founders(),
+            energy_of,
+            GrowAndDivide(0.3, 1.5),
+            jnp.linspace(0, 4, 6),
+            key=1,
+            relaxation=FIXED_TOPOLOGY,
+            checkpoint=file,
+        )
+
+
+@pytest.mark.thorough
 def test_daughters_inherit_the_states_of_activities(without_type_checks):
     activity = vx.activities.SelfPropulsion(0.02, 0.1, 0.5) + vx.activities.FluctuatingTensions(
         0.01, 1

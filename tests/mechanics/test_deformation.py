@@ -31,6 +31,23 @@ def test_deformation_gradients_of_shears():
     np.testing.assert_allclose(np.linalg.det(mechanics.pure_shear(0.3)), 1)
 
 
+@pytest.mark.thorough
+def test_a_ramp_with_a_checkpoint_continues(tmp_path):
+    file, strains = tmp_path / "ramp.npz", np.array([0.01, 0.0, 0.02])
+    run = lambda n, factor=1.0, **settings: mechanics.ramp(
+        start, ShapeFactorEnergy(factor * p0), strains[:n], relaxation=FIXED_TOPOLOGY, **settings
+    )
+    at_once, _ = run(3), run(2, checkpoint=file)
+    continued = run(3, checkpoint=file)
+    assert continued.converged
+    np.testing.assert_array_equal(continued.strains, strains)
+    np.testing.assert_allclose(continued.stresses, at_once.stresses, atol=1e-8)
+    assert len(continued.trajectory) == 3
+    np.testing.assert_allclose(continued.trajectory.values["strain"], strains)
+    with pytest.raises(ValueError, match="checkpoint of a ramp with another tissue, energy or"):
+        run(3, 1.01, checkpoint=file)
+
+
 @pytest.mark.slow
 def test_work_of_the_stress_equals_the_energy_change():
     energy = ShapeFactorEnergy(p0)

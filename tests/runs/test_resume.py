@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import vertax as vx
 from experiments._shared import scan
 from vertax.fitting._descent import Descent
 from vertax.runs import RunFolder
@@ -89,7 +90,7 @@ def test_a_resumed_run_has_the_same_numbers(finished, interrupt, tmp_path, epoch
     assert "kept so far: " in resumed.output
     assert tables(run) == tables(finished / "run")
     fitted, expected = (
-        np.load(f / "fitted_image.npz")["vertices"] for f in (run, finished / "run")
+        vx.io.load_tissue(f / "fitted_image.npz").vertices for f in (run, finished / "run")
     )
     np.testing.assert_array_equal(fitted, expected)
     assert not (run / "unfinished").exists()

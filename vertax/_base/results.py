@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from vertax._base.tracing import is_concrete
 
@@ -177,3 +177,28 @@ def checked(tree: Tree, result: RESULTS, describe: Callable[[], str] = str) -> T
 
 def _is_key(x: object) -> bool:
     return isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+class AbstractOutcome(eqx.Module):
+    """What a computation returns; its field or property `result` says how it ended."""
+
+    # (Not declared here: as a field of this class, `result` would be the first argument of each subclass.)
+
+    @property
+    def converged(self: Any) -> Bool[Array, "*batch"]:
+        """Whether the computation succeeded: `result` is `successful`."""
+        return self.result == RESULTS.successful
+
+    def checked(self: Tree) -> Tree:
+        """The same, if the computation succeeded.
+
+        **Raises:**
+
+        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if it did not.
+        """
+        outcome: Any = self
+        return checked(self, outcome.result, outcome._details)
+
+    def _details(self) -> str:
+        """Details of the failure for the message."""
+        return ""

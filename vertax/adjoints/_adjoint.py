@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from vertax._base.results import RESULTS, checked, result_of
+from vertax._base.results import RESULTS, AbstractOutcome, checked, result_of
 from vertax._base.tracing import is_concrete
 
 
@@ -20,7 +20,7 @@ def _floating(x: ArrayLike) -> Array:
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
 
 
-class GradientOutcome(eqx.Module):
+class GradientOutcome(AbstractOutcome):
     r"""Diagnostics of a gradient through an equilibrium.
 
     All methods solve $H\,\lambda = \partial C / \partial X$, each in a different way, so their diagnostics
@@ -52,17 +52,12 @@ class GradientOutcome(eqx.Module):
 
     @property
     def result(self) -> RESULTS:
-        """How the computation of the gradient ended.
+        """How the computation of the gradient ended; `successful` if the gradient is reliable.
 
         `degenerate`, or `nudge_not_linear`, if the equilibrium is not unique along motions that the cost
         depends on, so that the gradient does not exist.
         """
         return result_of(self.code)
-
-    @property
-    def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the gradient is reliable."""
-        return self.result == RESULTS.successful
 
 
 class AbstractAdjoint(optx.AbstractAdjoint):

@@ -16,16 +16,16 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
 from vertax._base.checks import as_key, as_times, check_integer, describe
+from vertax._base.frame_loop import simulate
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.tracing import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation, ImplicitDifferentiation
 from vertax.dissipations import AbstractDissipation
 from vertax.dynamics._evolved import Evolved
-from vertax.dynamics._long_run import evolve_by_frames
 from vertax.dynamics._material import Material
 from vertax.dynamics._pi_controller import PIController
-from vertax.dynamics._time_integration import check_order, evolve_at_once
+from vertax.dynamics._time_integration import Motion, check_order
 from vertax.energies import AbstractEnergy
 from vertax.mesh import AbstractBoundary, Tissue
 from vertax.relax import AbstractResponse, Relaxation
@@ -174,13 +174,21 @@ class Evolution(AbstractResponse):
         response._check(tissue)
         response._check_drive(tissue)
         warn_of_memory_maps()
-        args = (*traced((tissue, energy), tissue.vertices.dtype), response.traced())
+        tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
+        response = response.traced()
+        points = response.times.astype(tissue.vertices.dtype)
+        start, parts = (tissue, response.key, response.drive), lambda e: (e.times, e.key, e.drive)
+        is_none = lambda x: x is None
+        rule = eqx.tree_at(parts, response, (None, None, None), is_leaf=is_none)
         with announce_compilations(f"the evolution of {tissue.n_cells} cells"):
-            if progress or checkpoint is not None:
-                evolved = evolve_by_frames(*args, checkpoint, progress=progress, throw=throw)
-            else:
-                evolved = evolve_at_once(*args, adjoint)
-        return evolved.checked() if throw else evolved
+            return simulate(
+                Motion(energy, rule, adjoint),
+                start,
+                points,
+                progress=progress,
+                checkpoint=checkpoint,
+                throw=throw,
+            )
 
     def check_compatible(
         self, adjoint: AbstractAdjoint, *, guided: bool = False, placed: bool = False

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.results import RESULTS, checked
+from vertax._base.results import RESULTS
 from vertax.mesh import Tissue, Trajectory
 from vertax.relax import Equilibrium
 
@@ -55,15 +55,6 @@ class Evolved(Equilibrium):
         changed = jnp.any(cells[..., 1:, :, :] != cells[..., :-1, :, :], axis=-1)
         return jnp.concatenate([jnp.zeros_like(changed[..., :1, :]), changed], axis=-2)
 
-    def checked(self) -> Evolved:
-        """Return self if all steps converged.
-
-        **Raises:**
-
-        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if a step did not.
-        """
-        return checked(self, self.result, self._details)
-
     def _details(self) -> str:
         """The time and the force of the member of a batch that fails in the earliest frame."""
         converged = np.asarray(self.results == RESULTS.successful)
@@ -82,19 +73,9 @@ class Evolved(Equilibrium):
 
         **Raises:**
 
-        - `ValueError` for a batch.
+        - `ValueError` for a batch: take a `member` of it.
         """
-        if self.times.ndim != 1:
-            raise ValueError(
-                f"This is a batch of shape {self.times.shape[:-1]}, but a trajectory is a single evolution. "
-                "Select a member: vertax.fitting.member(movies, 0).trajectory."
-            )
-        trajectory = Trajectory()
-        arrays, static = eqx.partition(self.frames, eqx.is_array)
-        values = {"time": self.times, "energy": self.energies, "num_t1": self.transitions}
-        if eqx.is_array(self.signals):
-            values["signals"] = self.signals
-        for number in range(len(self.times)):
-            frame, frame_values = jax.tree.map(lambda x, i=number: x[i], (arrays, values))
-            trajectory.append(eqx.combine(frame, static), **frame_values)
-        return trajectory
+        signals = {"signals": self.signals} if eqx.is_array(self.signals) else {}
+        return Trajectory.from_frames(
+            self.frames, time=self.times, energy=self.energies, num_t1=self.transitions, **signals
+        )

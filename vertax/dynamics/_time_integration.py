@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
+from vertax._base.frame_loop import AbstractSimulation, Frame
 from vertax._base.results import RESULTS, first_failure, result_of
 from vertax._base.tracing import tree_where
 from vertax.adjoints import AbstractAdjoint
@@ -57,56 +57,70 @@ class State(eqx.Module):
         )
 
 
-class Frames(NamedTuple):
-    """The data of frames, along a leading axis."""
+class Motion(AbstractSimulation):
+    """The motion of a tissue, as a simulation of frames."""
 
-    tissue: PyTree[Array]
-    energies: Float[Array, " times"]
-    transitions: Int[Array, " times"]
-    results: RESULTS
-    steps: Float[Array, "times steps"]
-    num_rejected: Int[Array, " times"]
-    signals: PyTree[Array]
+    name: ClassVar[str] = "movement"
+    points: ClassVar[str] = "times"
 
+    energy: Any
+    evolution: Any
+    """An `Evolution` without its times, key and drive. (Its module imports this one, therefore `Any`.)"""
+    adjoint: AbstractAdjoint
 
-def initial_state(tissue: Tissue, evolution: Any) -> State:
-    """The initial state of an `Evolution`. (Its module imports this one, therefore the type `Any`.)"""
-    times = evolution.times.astype(tissue.vertices.dtype)
-    zero_count, zero = jnp.array(0), jnp.zeros((), times.dtype)
-    drive = evolution.drive
-    if drive is None and evolution.activity is not None:
-        first, rest = jax.random.split(evolution.key)
-        drive = (evolution.activity.init(tissue, first), rest)
-    dt = (
-        zero
-        if evolution.stepsize_controller is None
-        else evolution.stepsize_controller.begin(times)
-    )
-    return State(tissue, drive, dt, zero + 1, zero, zero_count, zero_count, _successful())
+    def begin(self, start: tuple[Tissue, Any, Any], points: Array) -> tuple[State, Frame]:
+        """The initial state and frame of a tissue, with a random key or a drive; see `Evolution`."""
+        tissue, key, drive = start
+        evolution, zero_count, zero = self.evolution, jnp.array(0), jnp.zeros((), points.dtype)
+        if drive is None and evolution.activity is not None:
+            first, rest = jax.random.split(key)
+            drive = (evolution.activity.init(tissue, first), rest)
+        control = evolution.stepsize_controller
+        dt, n_steps = zero, evolution.substeps
+        if control is not None:
+            dt, n_steps = control.begin(points), control.max_steps
+        state = State(tissue, drive, dt, zero + 1, zero, zero_count, zero_count, _successful())
+        frame = {
+            "frames": tissue,
+            "energies": _energy_at(self.energy, points[0])(tissue),
+            "transitions": zero_count,
+            "results": _successful(),
+            "steps": jnp.zeros(n_steps, points.dtype),
+            "num_rejected": zero_count,
+            "signals": _record(evolution, state),
+        }
+        return state, frame
 
+    def advance(self, state: State, interval: Array, key: Any) -> tuple[State, Frame]:
+        """Integrate over an interval of time."""
+        return integrate(state, interval, self.energy, self.evolution, self.adjoint)
 
-def first_frame(state: State, energy: Any, evolution: Any) -> Frames:
-    """The frame of the initial time, as one row of `Frames`."""
-    time = evolution.times.astype(state.tissue.vertices.dtype)[0]
-    tissue = eqx.filter(state.tissue, eqx.is_array)
-    n_steps = (
-        evolution.substeps
-        if evolution.stepsize_controller is None
-        else evolution.stepsize_controller.max_steps
-    )
-    steps = jnp.zeros(n_steps, time.dtype)
-    value = _energy_at(energy, time)(state.tissue)
-    record = _record(evolution, state)
-    row = Frames(tissue, value, jnp.array(0), _successful(), steps, jnp.array(0), record)
-    return jax.tree.map(lambda x: x[None], row)
+    def outcome(self, points: Array, end: State, frames: Frame) -> Evolved:
+        """The result of the evolution."""
+        return Evolved(
+            tissue=end.tissue,
+            energy=frames["energies"][-1],
+            max_force=end.max_force,
+            num_steps=end.num_steps,
+            num_t1=end.num_t1,
+            result=end.result,
+            times=points,
+            drive=end.drive,
+            **frames,
+        )
+
+    def counts(self, state: State) -> dict[str, Array]:
+        """The number of T1 transitions so far."""
+        return {"t1": state.num_t1}
 
 
 def integrate(
-    state: State, energy: Any, evolution: Any, adjoint: AbstractAdjoint
-) -> tuple[State, Frames]:
-    """Integrate from the first of the times of an `Evolution` to the last; return the later frames."""
-    times = evolution.times.astype(state.tissue.vertices.dtype)
+    state: State, ends: Array, energy: Any, evolution: Any, adjoint: AbstractAdjoint
+) -> tuple[State, Frame]:
+    """Integrate an `Evolution` over an interval; return the state and the frame at its end."""
     control, may_flip = evolution.stepsize_controller, evolution.relaxation.transitions is not None
+    arrays, static = eqx.partition(state, eqx.is_array)
+    combined = lambda arrays: eqx.combine(arrays, static)
 
     def stage(
         state: State,
@@ -195,7 +209,7 @@ def integrate(
         after = eqx.tree_at(lambda s: (s.dt, s.error), after, timing)
         return after, jnp.where(accepted, end, start), jnp.where(accepted, end - start, 0)
 
-    def controlled(arrays: State, ends: tuple[Array, Array]) -> tuple[State, Array, Array]:
+    def controlled(arrays: State, ends: Array) -> tuple[State, Array, Array]:
         """Steps of controlled size to the end of a frame, their sizes, and the number of rejected ones."""
 
         def one(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], tuple]:
@@ -203,7 +217,7 @@ def integrate(
                 state, time, dt = attempt(combined(carry[0]), carry[1], ends[1])
                 return (eqx.filter(state, eqx.is_array), time), (dt, dt == 0)
 
-            no_step = (jnp.zeros((), times.dtype), jnp.array(False))
+            no_step = (jnp.zeros((), ends.dtype), jnp.array(False))
             return jax.lax.cond(carry[1] < ends[1], take_step, lambda c: (c, no_step), carry)
 
         (arrays, time), (steps, num_rejected) = jax.lax.scan(
@@ -216,62 +230,28 @@ def integrate(
         steps = steps[jnp.argsort(steps == 0, stable=True)]
         return arrays, steps, num_rejected.sum()
 
-    def interval(arrays: State, ends: tuple[Array, Array]) -> tuple[State, Frames]:
-        before = arrays.num_t1
-        if control is not None:
-            arrays, steps, num_rejected = controlled(arrays, ends)
-        else:
-            fractions = jnp.linspace(0, 1, evolution.substeps + 1, dtype=times.dtype)
-            times_of_steps = ends[0] + fractions * (ends[1] - ends[0])
+    if control is not None:
+        arrays, steps, num_rejected = controlled(arrays, ends)
+    else:
+        fractions = jnp.linspace(0, 1, evolution.substeps + 1, dtype=ends.dtype)
+        times_of_steps = ends[0] + fractions * (ends[1] - ends[0])
 
-            def substep(arrays: State, ends: tuple[Array, Array]) -> tuple[State, None]:
-                return eqx.filter(step(combined(arrays), *ends), eqx.is_array), None
+        def substep(arrays: State, ends: tuple[Array, Array]) -> tuple[State, None]:
+            return eqx.filter(step(combined(arrays), *ends), eqx.is_array), None
 
-            arrays, _ = jax.lax.scan(substep, arrays, (times_of_steps[:-1], times_of_steps[1:]))
-            steps, num_rejected = jnp.diff(times_of_steps), jnp.array(0)
-        value = _energy_at(energy, ends[1])(combined(arrays).tissue)
-        transitions, record = arrays.num_t1 - before, _record(evolution, combined(arrays))
-        row = (arrays.tissue, value, transitions, arrays.result, steps, num_rejected, record)
-        return arrays, Frames(*row)
-
-    arrays, static = eqx.partition(state, eqx.is_array)
-    combined = lambda arrays: eqx.combine(arrays, static)
-    arrays, frames = jax.lax.scan(interval, arrays, (times[:-1], times[1:]))
-    return combined(arrays), frames
-
-
-def evolved(times: Float[Array, " times"], end: State, frames: Frames) -> Evolved:
-    """The result of an evolution from its final state and all frames."""
-    static = eqx.filter(end.tissue, eqx.is_array, inverse=True)
-    return Evolved(
-        tissue=end.tissue,
-        energy=frames.energies[-1],
-        max_force=end.max_force,
-        num_steps=end.num_steps,
-        num_t1=end.num_t1,
-        result=end.result,
-        times=times.astype(end.tissue.vertices.dtype),
-        frames=eqx.combine(frames.tissue, static),
-        energies=frames.energies,
-        transitions=frames.transitions,
-        drive=end.drive,
-        results=frames.results,
-        steps=frames.steps,
-        num_rejected=frames.num_rejected,
-        signals=frames.signals,
-    )
-
-
-@announced_jit
-def evolve_at_once(
-    tissue: Tissue, energy: Any, evolution: Any, adjoint: AbstractAdjoint
-) -> Evolved:
-    """All frames by one compiled function."""
-    start = initial_state(tissue, evolution)
-    first = first_frame(start, energy, evolution)
-    end, frames = integrate(start, energy, evolution, adjoint)
-    frames = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), first, frames)
-    return evolved(evolution.times, end, frames)
+        arrays, _ = jax.lax.scan(substep, arrays, (times_of_steps[:-1], times_of_steps[1:]))
+        steps, num_rejected = jnp.diff(times_of_steps), jnp.array(0)
+    after = combined(arrays)
+    frame = {
+        "frames": after.tissue,
+        "energies": _energy_at(energy, ends[1])(after.tissue),
+        "transitions": after.num_t1 - state.num_t1,
+        "results": after.result,
+        "steps": steps,
+        "num_rejected": num_rejected,
+        "signals": _record(evolution, after),
+    }
+    return after, frame
 
 
 def _energy_at(energy: Any, time: Any) -> AbstractEnergy:

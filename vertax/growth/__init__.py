@@ -1,6 +1,7 @@
 """Growth: cell growth, division and death, with the cell lineage."""
 
-from vertax.growth._grow import Grown as Grown, grow as grow
+from vertax.growth._grow import grow as grow
+from vertax.growth._grown import Grown as Grown
 from vertax.growth._life_cycle import (
     AbstractLifeCycle as AbstractLifeCycle,
     Cells as Cells,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,17 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.announce import announced_jit
+from vertax._base.announce import announce_compilations
 from vertax._base.batch import member
+from vertax._base.checkpoints import Checkpoint
 from vertax._base.checks import as_real, describe
-from vertax._base.results import RESULTS, checked, first_of
+from vertax._base.frame_loop import AbstractSimulation, Frame, simulate
+from vertax._base.results import RESULTS, AbstractOutcome, first_failure, first_of, result_of
 from vertax._base.tracing import traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.mechanics._arguments import as_matrix, check_relaxation, check_system
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
-from vertax.mesh import Tissue
+from vertax.mesh import Tissue, Trajectory
 from vertax.relax import Relaxation
 
 Deformation = Callable[[Float[Array, ""]], Float[Array, "2 2"]]
@@ -49,7 +53,7 @@ def _as_strain(strain: ArrayLike) -> Float[Array, ""]:
     return value
 
 
-class Ramp(eqx.Module):
+class Ramp(AbstractOutcome):
     """The relaxed tissue at each strain of a quasi-static deformation."""
 
     strains: Float[Array, " strains"]
@@ -75,23 +79,15 @@ class Ramp(eqx.Module):
         """How the ramp ended: the first failure."""
         return first_of(self.results)
 
-    @property
-    def converged(self) -> Bool[Array, ""]:
-        """Whether all relaxations converged."""
-        return self.result == RESULTS.successful
-
-    def checked(self) -> Ramp:
-        """The same, if all relaxations converged.
-
-        **Raises:**
-
-        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if they did not.
-        """
-        return checked(self, self.result, self._details)
-
     def _details(self) -> str:
         number = int(np.argmax(self.results != RESULTS.successful))
         return f"strain {self.strains[number]:g}, number {number}"
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The relaxed tissues as a trajectory, for [`animate`][vertax.animate] and for files."""
+        values = {"strain": self.strains, "energy": self.energies, "num_t1": self.num_t1}
+        return Trajectory.from_frames(self.frames, **values)
 
     @property
     def plastic(self) -> Bool[Array, " strains"]:
@@ -108,6 +104,8 @@ def ramp(
     relaxation: Relaxation = Relaxation(),
     adjoint: AbstractAdjoint = ImplicitDifferentiation(),
     throw: bool = True,
+    progress: bool = False,
+    checkpoint: str | os.PathLike[str] | Checkpoint | None = None,
 ) -> Ramp:
     r"""Deform a tissue quasi-statically at zero temperature (AQS), through its T1 transitions.
 
@@ -133,15 +131,17 @@ def ramp(
     - `adjoint`: the differentiation method, [`ImplicitDifferentiation`][vertax.ImplicitDifferentiation] by
         default.
     - `throw`: raise an error if a relaxation does not converge.
+    - `progress`: show a progress bar (only on a terminal).
+    - `checkpoint`: a file, or a [`Checkpoint`][vertax.Checkpoint], as in [`evolve`][vertax.evolve].
 
-    **Returns:** a [`Ramp`][vertax.mechanics.Ramp]; its `frames` form a trajectory. Differentiable with
-        respect to the energy, as long as the same transitions happen in the same steps.
+    **Returns:** a [`Ramp`][vertax.mechanics.Ramp], differentiable with respect to the energy, as long as the
+        same transitions happen in the same steps.
 
     **Raises:**
 
     - `TypeError` for an argument of the wrong class.
-    - `ValueError` for a free tissue, strains that are not a list of numbers, or a deformation of another
-        shape.
+    - `ValueError` for a free tissue, strains that are not a list of numbers, a deformation of another shape,
+        or a checkpoint that is broken or of another run.
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a relaxation did not converge.
     """
     check_system(tissue, energy, box="a ramp")
@@ -159,28 +159,61 @@ def ramp(
     check_relaxation(relaxation)
     tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     relaxation.check(tissue, energy, adjoint)
-    result = _ramp(tissue, energy, values, deformation, relaxation.traced(), adjoint)
-    return result.checked() if throw else result
+    simulation = _Deformation(tissue, energy, deformation, relaxation.traced(), adjoint)
+    # The first frame is the undeformed tissue.
+    points = jnp.concatenate([jnp.zeros_like(values[:1]), values])
+    with announce_compilations(f"the deformation of {tissue.n_cells} cells"):
+        return simulate(
+            simulation,
+            tissue,
+            points,
+            progress=progress,
+            checkpoint=checkpoint,
+            throw=throw,
+        )
 
 
-@announced_jit
-def _ramp(
-    tissue: Tissue,
-    energy: AbstractEnergy,
-    strains: Float[Array, " strains"],
-    deformation: Deformation,
-    relaxation: Relaxation,
-    adjoint: AbstractAdjoint,
-) -> Ramp:
-    arrays, static = eqx.partition(tissue, eqx.is_array)
+class _State(eqx.Module):
+    tissue: Tissue
+    num_t1: Int[Array, ""]
+    result: RESULTS
 
-    def step(arrays: Tissue, strain: Array) -> tuple[Tissue, tuple]:
-        box = deformed(tissue, deformation(strain)).boundary
-        start = eqx.combine(arrays, static).carried(box)
-        rest = relaxation.solve(start, energy, adjoint, recompute=True)
-        arrays = eqx.filter(rest.tissue, eqx.is_array)
-        frame = (arrays, rest.energy, stress(rest.tissue, energy), rest.num_t1, rest.result)
-        return arrays, frame
 
-    _, (frames, *rest) = jax.lax.scan(step, arrays, strains)
-    return Ramp(strains, eqx.combine(frames, static), *rest)
+class _Deformation(AbstractSimulation):
+    name: ClassVar[str] = "ramp"
+    points: ClassVar[str] = "strains"
+
+    initial: Tissue
+    energy: AbstractEnergy
+    deformation: Deformation
+    relaxation: Relaxation
+    adjoint: AbstractAdjoint
+
+    def begin(self, start: Tissue, points: Array) -> tuple[_State, Frame]:
+        zero, count = jnp.zeros((), points.dtype), jnp.array(0)
+        state = _State(start, count, result_of(count))
+        return state, _frame(start, zero, jnp.zeros((2, 2), points.dtype), count, state.result)
+
+    def advance(self, state: _State, interval: Array, key: Any) -> tuple[_State, Frame]:
+        box = deformed(self.initial, self.deformation(interval[1])).boundary
+        rest = self.relaxation.solve(
+            state.tissue.carried(box), self.energy, self.adjoint, recompute=True
+        )
+        stresses, result = (
+            stress(rest.tissue, self.energy),
+            first_failure(state.result, rest.result),
+        )
+        frame = _frame(rest.tissue, rest.energy, stresses, rest.num_t1, rest.result)
+        return _State(rest.tissue, state.num_t1 + rest.num_t1, result), frame
+
+    def outcome(self, points: Array, end: _State, frames: Frame) -> Ramp:
+        after_first = lambda x: x[1:] if eqx.is_array(x) else x
+        return Ramp(strains=points[1:], **jax.tree.map(after_first, frames))
+
+    def counts(self, state: _State) -> dict[str, Array]:
+        return {"t1": state.num_t1}
+
+
+def _frame(tissue: Tissue, energy: Array, stresses: Array, num_t1: Array, result: RESULTS) -> Frame:
+    names = ("frames", "energies", "stresses", "num_t1", "results")
+    return dict(zip(names, (tissue, energy, stresses, num_t1, result), strict=True))

@@ -59,6 +59,31 @@ class Trajectory(Sequence[Tissue]):
         self._frames: list[Tissue] = []
         self._values: dict[str, list[int | float | np.ndarray]] = {}
 
+    @classmethod
+    def from_frames(cls, frames: Tissue, **values: Shaped[ArrayLike, "frames ..."]) -> Trajectory:
+        """The trajectory of one tissue with a leading axis, such as the `frames` of an evolution.
+
+        **Arguments:**
+
+        - `frames`: the tissue, each of its arrays with a leading axis.
+        - `values`: numbers or arrays of the frames by name, with the same leading axis.
+
+        **Raises:**
+
+        - `ValueError` for a tissue without a leading axis or with several, and as `append`.
+        """
+        if frames.vertices.ndim != 3:
+            raise ValueError(
+                "Argument `frames` must be one tissue with one leading axis, but its vertices have shape "
+                f"{frames.vertices.shape}. Take one of a batch of them: vertax.fitting.member(batch, 0)."
+            )
+        trajectory = cls()
+        stacked = jax.tree.map(np.asarray, (frames, values))
+        for i in range(len(frames.vertices)):
+            frame, numbers = jax.tree.map(lambda x, i=i: x[i], stacked)
+            trajectory.append(frame, **numbers)
+        return trajectory
+
     def append(self, tissue: Tissue, **values: ArrayLike) -> None:
         """Add a frame.
 

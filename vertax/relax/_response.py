@@ -8,13 +8,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.results import RESULTS, checked
+from vertax._base.results import RESULTS, AbstractOutcome
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 
 
-class Equilibrium(eqx.Module):
+class Equilibrium(AbstractOutcome):
     """A relaxed tissue; under `jax.vmap` with one entry for each of the batch."""
 
     tissue: Tissue
@@ -28,22 +28,8 @@ class Equilibrium(eqx.Module):
     num_t1: Int[Array, "*batch"]
     """Number of transitions: T1, and T2 if the rule has them."""
     result: RESULTS
-    """How the relaxation ended; `vertax.RESULTS[result]` is the message. `tissue.overlaps` says where cells
-    overlap."""
-
-    @property
-    def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the largest force fell below the tolerance, in a tissue without overlaps."""
-        return self.result == RESULTS.successful
-
-    def checked(self) -> Equilibrium:
-        """The same, if it converged.
-
-        **Raises:**
-
-        - `RuntimeError` (of Equinox inside `jax.jit`) with the message of `result` if it did not.
-        """
-        return checked(self, self.result, self._details)
+    """How the relaxation ended; `vertax.RESULTS[result]` is the message. It is `successful` if the largest
+    force fell below the tolerance, in a tissue without overlaps (`tissue.overlaps` says where they are)."""
 
     def _details(self) -> str:
         texts = [f"largest force {np.max(self.max_force):.1e} after {np.max(self.num_steps)} steps"]

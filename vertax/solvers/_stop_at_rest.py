@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +22,7 @@ class StopAtRestState(eqx.Module):
     num_steps: Int[Array, ""]
 
 
-class StopAtRest(optx.AbstractMinimiser):
+class StopAtRest(AbstractSolver):
     """A solver that stops after a number of consecutive steps with the largest force below a tolerance.
 
     It has two options in addition to those of the solver: `max_steps`, the maximum number of steps; and
@@ -37,9 +36,6 @@ class StopAtRest(optx.AbstractMinimiser):
 
     solver: AbstractSolver
     consecutive_steps: int | Int[Array, ""] = 1
-    rtol: float = 0.0
-    atol: float = 0.0
-    norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(default=optx.max_norm, static=True)
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
@@ -64,11 +60,6 @@ class StopAtRest(optx.AbstractMinimiser):
             done |= state.num_steps >= options.get("max_steps", jnp.inf)
         return done, optx.RESULTS.successful
 
-    def postprocess(
-        self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        return y, aux, {}
-
     def at_rest(self, state: StopAtRestState) -> Bool[Array, ""]:
         """Whether the force was below the tolerance for `consecutive_steps`."""
         return state.num_below >= self.consecutive_steps
@@ -86,12 +77,8 @@ class StopAtRest(optx.AbstractMinimiser):
         return StopAtRestState(inner, progress.force, num_below, num_steps + progress.stepped)
 
 
-class AtRest(optx.AbstractMinimiser):
+class AtRest(AbstractSolver):
     """A minimiser that takes no step: it returns its initial point, which must be a minimum."""
-
-    rtol: float = 0.0
-    atol: float = 0.0
-    norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(default=optx.max_norm, static=True)
 
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
@@ -108,15 +95,5 @@ class AtRest(optx.AbstractMinimiser):
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         return jnp.array(True), optx.RESULTS.successful
 
-    def postprocess(
-        self,
-        fn: Any,
-        y: Any,
-        aux: Any,
-        args: Any,
-        options: Any,
-        state: None,
-        tags: Any,
-        result: Any,
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        return y, aux, {}
+    def gradient(self, state: None) -> None:
+        return None

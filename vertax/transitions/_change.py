@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
 from vertax._base.axes import AXES, gather
-from vertax._base.results import RESULTS
+from vertax._base.results import RESULTS, AbstractOutcome
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 
 Tree = TypeVar("Tree")
 
 
-class Change(eqx.Module):
+class Change(AbstractOutcome):
     """The tissue after a division or removal, and the parent index of each cell, edge and vertex."""
 
     tissue: Tissue
@@ -29,11 +28,6 @@ class Change(eqx.Module):
     """Index of the old vertex with the parameters of each vertex: itself, or the start of the split edge."""
     result: RESULTS
     """Why the change was not made; the tissue is unchanged unless `successful`."""
-
-    @property
-    def converged(self) -> Bool[Array, "*batch"]:
-        """Whether the change was made."""
-        return self.result == RESULTS.successful
 
     def inherited(self, tree: Tree, *, axis: str | None = None) -> Tree:
         """An energy, or another pytree, with the entries of parents for new cells, edges and vertices.
