@@ -60,6 +60,7 @@ class Movie(eqx.Module):
     - `filled`: for each frame the numbers of cells that were not observed but fill a hole; each is an event
         `"gap"`.
     - `repairs`: what a reader mended.
+    - `outline_nodes`: for each frame the number of nodes inside each edge: 0 except on the outline.
     - `largest_jump`: largest distance that a centroid moves from one frame to the next, in units of the
         root of the mean cell area.
 
@@ -81,6 +82,9 @@ class Movie(eqx.Module):
     """What changed between frames, in the order of frames."""
     repairs: tuple[Repair, ...]
     """What [`movie_from_table`][vertax.inference.movie_from_table] mended, in the order of frames."""
+    outline_nodes: Int[np.ndarray, "frames edges"] | None
+    """The number of points of a table inside each edge, for a free tissue; see `node_friction` of
+    [`fit_movie`][vertax.inference.fit_movie]."""
 
     def __init__(
         self,
@@ -91,6 +95,7 @@ class Movie(eqx.Module):
         types: dict[int, int] | None = None,
         filled: Sequence[Sequence[int]] | None = None,
         repairs: Sequence[Repair] = (),
+        outline_nodes: Sequence[Int[np.ndarray, " edges"]] | None = None,
         largest_jump: float = 1.0,
     ):
         check_number("largest_jump", largest_jump, above=0)
@@ -124,6 +129,11 @@ class Movie(eqx.Module):
             _with_slots_of(t, np.searchsorted(self.cells, n), len(self.cells))
             for n, t in zip(numbers, tissues, strict=True)
         ]
+        self.outline_nodes = None
+        if outline_nodes is not None:
+            self.outline_nodes = np.zeros((len(placed), placed[0].n_edges), int)
+            for row, inside in zip(self.outline_nodes, outline_nodes, strict=True):
+                row[: len(inside)] = inside
         softening = placed[0].softening
         self.tissue = stack([eqx.tree_at(lambda t: t.softening, t, softening) for t in placed])
 

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vertax._base.indexing import take
 from vertax.costs import matching_vertices
@@ -27,6 +27,8 @@ class Settings(eqx.Module):
     """In units of length."""
     fit_friction: bool = eqx.field(static=True)
     outline: bool = eqx.field(static=True)
+    most_nodes: int = eqx.field(static=True)
+    """Largest number of nodes inside a side of the outline; 0 if they have no friction."""
 
     def energy(self, theta: Float[Array, " parameters"]) -> AbstractEnergy:
         parameters = theta[:-1] if self.fit_friction else theta
@@ -52,13 +54,14 @@ def equations(
     theta: Float[Array, " parameters"],
     floor: Float[Array, ""],
     triple: list[Tissue],
+    nodes: Int[Array, " edges"] | None,
     dt: Float[Array, ""],
     used: Bool[Array, ""],
 ) -> tuple[Array, ...]:
     """Of one step: ZᵀWr, ZᵀWG, the diagonals of ZᵀWZ and GᵀWG, and sums of squares.
 
     The sums are those of squared residuals and of variances by tracking, per component, and the number of
-    vertices.
+    vertices. `nodes` are those inside the edges of the last frame.
     """
     before, start, end = triple
     to_before, in_before = matching_vertices(end, before)
@@ -72,7 +75,10 @@ def equations(
         outside = end.topology.cell[end.topology.twin] == end.n_cells
         outer = jnp.zeros(end.n_cells + 2, bool).at[end.topology.cell].max(outside)
         use &= ~jnp.any(outer[cells] | (cells == end.n_cells), axis=1)
-    velocity = end.boundary.shortest(end.vertices - take(start.vertices, to_start)) / dt
+    moved = end.boundary.shortest(end.vertices - take(start.vertices, to_start))
+    if nodes is not None and settings.most_nodes:
+        moved += moved_nodes(start, end, to_start, in_start, nodes, settings.most_nodes)
+    velocity = moved / dt
     alpha = settings.implicitness
 
     def residual(theta: Array) -> tuple[Array, Array]:
@@ -105,6 +111,50 @@ def equations(
     scales = jnp.stack([jnp.einsum("vip,v,vip->p", x, w, x) for x in (z, g)])
     squares = jnp.stack([jnp.sum(r**2) / 2, jnp.sum(tracking), jnp.sum(use).astype(r.dtype)])
     return moments, slopes, scales, squares
+
+
+def moved_nodes(
+    start: Tissue,
+    end: Tissue,
+    to_start: Int[Array, " vertices"],
+    in_start: Bool[Array, " vertices"],
+    nodes: Int[Array, " edges"],
+    most: int,
+) -> Float[Array, "vertices 2"]:
+    r"""Displacements of the nodes inside the sides of the outline, in the coordinates of their ends.
+
+    The nodes divide the arc between $x_a$ and $x_b$ into equal parts, at $x_k = (1 - z_k) x_a + z_k x_b$ in
+    complex numbers, with $z_k = e^{i \alpha (s - 1)} \sin(\alpha s) / \sin \alpha$ at the fraction $s$ of an
+    arc of half-angle $\alpha$. Friction at the nodes is a force on the coordinates of the arc: that on $x_a$
+    is $\sum_k (1 - \bar z_k) \dot x_k$ times the friction of a node, and $\sum_k \bar z_k \dot x_k$ on $x_b$.
+    """
+    a, b = end.topology.edge_vertices.T
+    ends = to_start[jnp.stack([a, b])]
+    # The side in the frame before: on the outline, with the same vertices.
+    edges = start.topology.edge.reshape(-1, 3)[ends[0]]
+    same = jnp.any(start.topology.edge_vertices[edges] == ends[1][:, None, None], axis=-1)
+    same &= start.topology.on_outline[edges]
+    before = jnp.take_along_axis(edges, jnp.argmax(same, axis=1)[:, None], axis=1)[:, 0]
+    number = jnp.arange(1, most + 1)
+    fraction = number / (nodes[:, None] + 1)
+    use = jnp.any(same, axis=1) & in_start[a] & in_start[b]
+    use = use[:, None] & (number <= nodes[:, None])
+
+    def weights(angles: Float[Array, " edges"]) -> Complex[Array, "edges nodes"]:
+        angles = angles[:, None]
+        ratio = jnp.sinc(angles * fraction / jnp.pi) / jnp.sinc(angles / jnp.pi)
+        return jnp.exp(1j * angles * (fraction - 1)) * ratio * fraction
+
+    def places(tissue: Tissue, ends: Array, angles: Array) -> Complex[Array, "edges nodes"]:
+        x = tissue.vertices[ends, 0] + 1j * tissue.vertices[ends, 1]
+        return x[0][:, None] + (x[1] - x[0])[:, None] * weights(angles)
+
+    after = places(end, jnp.stack([a, b]), end.edge_angles)
+    moved = jnp.where(use, after - places(start, ends, start.edge_angles[before]), 0)
+    z = jnp.conj(weights(end.edge_angles))
+    sums = jnp.zeros(end.n_vertices, moved.dtype)
+    sums = sums.at[a].add(((1 - z) * moved).sum(axis=1)).at[b].add((z * moved).sum(axis=1))
+    return jnp.stack([sums.real, sums.imag], axis=-1)
 
 
 _N_PROBES = 16

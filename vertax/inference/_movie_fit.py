@@ -38,8 +38,8 @@ class MovieFit(eqx.Module):
     energy: AbstractEnergy
     """The energy with the fitted parameters."""
     deviation: AbstractEnergy
-    """Standard errors in the place of the parameters; infinite for those that the movie does not determine,
-    and NaN with fewer steps than parameters."""
+    """Standard errors in the place of the parameters, which include `interval_error`; infinite for those that
+    the movie does not determine, and NaN with fewer steps than parameters."""
     interval_error: AbstractEnergy
     """Change of the parameters with the other `implicitness`, 0.5 or 1: the order of magnitude of the error
     by the time between frames."""
@@ -85,6 +85,7 @@ def fit_movie(
     implicitness: float = 1.0,
     min_edge_length: float = 4.0,
     outline: bool = True,
+    node_friction: bool = False,
     windows: int | None = None,
     max_steps: int = 30,
 ) -> MovieFit:
@@ -116,7 +117,8 @@ def fit_movie(
 
     Velocities between frames approximate those of the motion only if the forces change little in that time.
     The fit is repeated with $\alpha = 0.5$, or 1 if $\alpha \le 0.75$, and `interval_error` is the
-    difference. A warning appears if a parameter changes by more than three standard errors and 5 %.
+    difference $\delta$. A warning appears if a parameter changes by more than three standard errors and 5 %;
+    then $\delta \delta^\mathsf T$ is added to the covariance.
 
     | symbol | argument | choose |
     |---|---|---|
@@ -149,6 +151,8 @@ def fit_movie(
     - `min_edge_length`: length of the shortest edge of a vertex that is used, in units of `noise`.
     - `outline`: whether to use the vertices of cells on the outline; False for a part of a tissue, and for
         tables of corners without the bulges of outer sides.
+    - `node_friction`: whether the points along the outer sides of the table are nodes that have the friction
+        of a vertex, as in Chaste. Then their friction acts on the vertices at the ends of a side.
     - `windows`: split the steps into this number of parts and fit each, in parallel.
     - `max_steps`: largest number of Newton steps; one is enough for parameters of which forces are linear
         functions, but weights change.
@@ -163,7 +167,7 @@ def fit_movie(
     **Raises:**
 
     - `ValueError` for numbers out of range, fewer than three frames, an energy without arrays, more windows
-        than steps, and if no vertex survives three frames.
+        than steps, `node_friction` for a movie without nodes, and if no vertex survives three frames.
     """
     check_energy(energy)
     check_number("friction", friction, above=0)
@@ -183,6 +187,12 @@ def fit_movie(
     if n_windows > n_steps:
         raise ValueError(
             f"Argument `windows` must be at most the number of steps, {n_steps}, but is {n_windows}."
+        )
+    nodes = movie.outline_nodes if node_friction else None
+    if node_friction and nodes is None:
+        raise ValueError(
+            "Argument `node_friction` must be False for a movie without nodes on its outline. Read the table "
+            "of a free tissue by vertax.inference.movie_from_table."
         )
     parameters, static = eqx.partition(energy, eqx.is_inexact_array)
     theta, unravel = ravel_pytree(parameters)
@@ -204,6 +214,7 @@ def fit_movie(
         min_edge_length=min_edge_length * sigma,
         fit_friction=fit_friction,
         outline=outline,
+        most_nodes=0 if nodes is None else int(nodes.max()),
     )
     _warn_of_straight_outlines(movie.tissue, outline)
     parts = np.array_split(np.arange(n_steps), n_windows)
@@ -214,7 +225,7 @@ def fit_movie(
     )
     with announce_compilations("a fit of a movie"):
         best, compared = (
-            _solve_windows(movie.tissue, times, each, theta, steps, used, max_steps)
+            _solve_windows(movie.tissue, nodes, times, each, theta, steps, used, max_steps)
             for each in (settings, other)
         )
     if not np.all(best.num_equations > 0):
@@ -229,6 +240,11 @@ def fit_movie(
     names = [*_names(parameters), *["friction"] * fit_friction]
     undetermined = _undetermined(names, best)
     _warn_of_long_intervals(best.theta[:, :n], change[:, :n], deviations[:, :n])
+    # (The covariance of a parameter that is not determined stays as it is.)
+    known = jnp.isfinite(deviations)
+    known = known[:, :, None] & known[:, None, :]
+    covariance = best.covariance + jnp.where(known, change[:, :, None] * change[:, None, :], 0)
+    deviations = jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2))
     in_energy = eqx.filter_vmap(settings.energy, out_axes=eqx.if_array(0))
     fits = MovieFit(
         energy=in_energy(best.theta),
@@ -236,7 +252,7 @@ def fit_movie(
         interval_error=in_energy(change),
         friction=jax.vmap(settings.zeta)(best.theta),
         friction_deviation=deviations[:, -1] if fit_friction else jnp.zeros(n_windows, dtype),
-        covariance=best.covariance,
+        covariance=covariance,
         noise=jnp.full(n_windows, sigma),
         misfit=best.misfit,
         num_equations=best.num_equations,
@@ -343,6 +359,7 @@ def _warn_of_long_intervals(
 @announced_jit
 def _solve_windows(
     frames: Tissue,
+    nodes: Int[Array, "frames edges"] | None,
     times: Float[Array, " frames"],
     settings: Settings,
     theta: Float[Array, " parameters"],
@@ -358,7 +375,8 @@ def _solve_windows(
         def one(item: tuple[Array, Array]) -> tuple[Array, ...]:
             triple = [frame_at(frames, item[0] + j) for j in range(3)]
             dt = times[item[0] + 2] - times[item[0] + 1]
-            return equations(settings, theta, floor, triple, dt, item[1])
+            inside = None if nodes is None else nodes[item[0] + 2]
+            return equations(settings, theta, floor, triple, inside, dt, item[1])
 
         return jax.lax.map(one, (steps, used))
 

@@ -13,10 +13,9 @@ from vertax._base.checks import as_float64, check_number
 from vertax.inference._movie import Movie, Repair
 from vertax.inference._movie_polygons import Numbering, Polygons, check_given, polygons_of
 from vertax.initialise._nearby_corners import SharedCorners, build_within, share_corners
-from vertax.initialise._polygons import checked_lattice, tissue_from_corners
+from vertax.initialise._polygons import PolygonTissue, checked_lattice, tissue_from_corners
 from vertax.io import read_table
 from vertax.io._read_table import column, whole_numbers
-from vertax.mesh import Tissue
 
 # Smallest area of a hole that a cell fills, in mean areas, and largest error of rounding, in cell sizes.
 _LEAST_HOLE, _LARGEST_ROUNDING = 0.05, 0.05
@@ -86,7 +85,7 @@ def movie_from_table(
     times = read("time") if "time" in names else frame
     given = {name: read(name) for name in _GIVEN if name in names}
     lattice = None if box is None else checked_lattice(box)
-    tissues, numbers, moments, filled, repairs = [], [], [], [], []
+    tissues, numbers, moments, filled, repairs, nodes = [], [], [], [], [], []
     last_seen: dict[int, np.ndarray] = {}
     numbering = Numbering(lattice, largest_jump)
     in_movie = cell.copy()
@@ -101,14 +100,16 @@ def movie_from_table(
         cells, renumbered = numbering.next_frame(polygons)
         of_cell = dict(zip(polygons.cells.tolist(), cells.tolist(), strict=True))
         in_movie[rows] = [of_cell[each] for each in cell[rows].tolist()]
-        tissue, added, mended = _one_frame(polygons, cells, box, lattice, tolerance, last_seen)
+        result, added, mended = _one_frame(polygons, cells, box, lattice, tolerance, last_seen)
         mended["listed twice"] = [of_cell[each] for each in copies]
         repairs += renumbered
         repairs += [
             Repair(kind, len(tissues), tuple(each)) for kind, each in mended.items() if each
         ]
         filled.append(added)
-        tissues.append(tissue)
+        tissues.append(result.tissue)
+        sides = np.bincount(result.side_edges, minlength=result.tissue.n_edges)
+        nodes.append(np.where(result.tissue.topology.on_outline, sides - 1, 0))
         numbers.append(np.append(cells, np.array(added, int)))
         moments.append(float(times[rows[0]]))
     types = _types(in_movie, whole_numbers(table, "type", "table")) if "type" in names else None
@@ -119,6 +120,7 @@ def movie_from_table(
         types=types,
         filled=filled,
         repairs=repairs,
+        outline_nodes=nodes if box is None else None,
         largest_jump=largest_jump,
     )
 
@@ -130,11 +132,11 @@ def _one_frame(
     lattice: Float[np.ndarray, "2 2"] | None,
     tolerance: float | None,
     last_seen: dict[int, np.ndarray],
-) -> tuple[Tissue, list[int], dict[str, list[int]]]:
+) -> tuple[PolygonTissue, list[int], dict[str, list[int]]]:
     """The tissue of a frame, the numbers of cells that fill holes, and those of cells that were mended."""
     names, size, places = polygons.names, polygons.size, polygons.places
 
-    def build(within: float) -> tuple[Tissue, list[int], SharedCorners]:
+    def build(within: float) -> tuple[PolygonTissue, list[int], SharedCorners]:
         shared = share_corners(places, polygons.corners, polygons.images, lattice, within)
         cells, added = shared.cells.copy(), []
         if box is None:
@@ -154,18 +156,19 @@ def _one_frame(
         )
         images = None if box is None else shared.images
         result = tissue_from_corners(shared.points, cells, named, box=box, images=images)
-        return result.tissue, added, shared
+        return result, added, shared
 
-    result = None
+    built = None
     least = 1e-6 * size if tolerance is None else tolerance
     rounding = 2 * _rounding(places)
     if tolerance is None and least < rounding < _LARGEST_ROUNDING * size:
         # Corners of one point that were rounded separately differ.
         for within in (least, rounding):
             with suppress(ValueError):
-                result = result or build(within)
-    tissue, added, shared = result or build_within(build, least, size, names.subject)
-    last_seen.update(zip([*numbers.tolist(), *added], np.asarray(tissue.centroids), strict=True))
+                built = built or build(within)
+    result, added, shared = built or build_within(build, least, size, names.subject)
+    places = np.asarray(result.tissue.centroids)
+    last_seen.update(zip([*numbers.tolist(), *added], places, strict=True))
     given = np.array([len(cell) for cell in polygons.corners])
     sides = np.split(shared.side, np.cumsum(given)[:-1])
     repeated = np.array([int((side < 0).sum()) for side in sides])
@@ -175,7 +178,7 @@ def _one_frame(
         "repeated corner": repeated > 0,
         "inserted corner": now > given - repeated,
     }
-    return tissue, added, {kind: numbers[cells].tolist() for kind, cells in mended.items()}
+    return result, added, {kind: numbers[cells].tolist() for kind, cells in mended.items()}
 
 
 def _rounding(places: Float[np.ndarray, "corners 2"]) -> float:
