@@ -5,8 +5,8 @@
 Two programs make the movies, of 16 cells and 41 frames:
 
 - `implicit`: `vertax.evolve` with ten steps between frames, a periodic tissue with T1 transitions;
-- `chains`: explicit Euler steps of a cluster without transitions, in which each side on the outline is a chain
-  of four straight pieces. Its nodes have the friction of a vertex, as in Chaste, and equal distances in each
+- `chains`: explicit Euler steps of a cluster without transitions, in which each outer side is a chain of
+  four straight pieces. Its nodes have the friction of a vertex, as in Chaste, and equal distances in each
   frame.
 
 A row for each program, tracking noise and kind of tension: the root mean square error, the mean standard
@@ -19,6 +19,7 @@ import argparse
 import itertools
 import warnings
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -57,7 +58,7 @@ def implicit(seed: int) -> list[vx.Tissue]:
     return list(vx.evolve(tissue, energy, friction, times, substeps=10).trajectory)
 
 
-def cluster_of_chains(seed: int) -> tuple[np.ndarray, list[list[int]], np.ndarray, np.ndarray]:
+def cluster_of_chains(seed: int) -> tuple[np.ndarray, list[list[Any]], np.ndarray, np.ndarray]:
     """Nodes of a free tissue, the nodes of each cell, and the nodes and the kind of each straight piece.
 
     Pieces of a chain follow one another.
@@ -66,14 +67,14 @@ def cluster_of_chains(seed: int) -> tuple[np.ndarray, list[list[int]], np.ndarra
     tissue = vx.equilibrate(tissue, energy_of(TABLE_BEFORE, jnp.array(OUTLINE_BEFORE))).tissue
     m, lines = tissue.topology, vx.mesh.Drawing(tissue, PIECES).lines
     nodes = list(np.asarray(tissue.vertices))
-    corners: list[list[int]] = [[] for _ in range(N_CELLS)]
+    corners: list[list[Any]] = [[] for _ in range(N_CELLS)]
     pieces, kinds, cell = [], [], np.asarray(m.cell)
     source, following, twin = (np.asarray(x) for x in (m.source, m.next, m.twin))
     for first in np.unique(cell, return_index=True)[1]:
         h, outside = first, cell[first] == N_CELLS
         while not outside and (h != first or not corners[cell[h]]):
             start, end, other = source[h], source[following[h]], cell[twin[h]]
-            chain = [start]
+            chain: list[Any] = [start]
             if other == N_CELLS:
                 for k in range(1, PIECES):
                     chain.append(len(nodes))
@@ -141,12 +142,20 @@ def noisy(movie: Movie, noise: float, seed: int) -> Movie:
     return eqx.tree_at(lambda m: m.tissue.vertices, movie, moved)
 
 
-def fitted(movie: Movie, noise: float, outline: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Tensions and their standard errors, that of the outline last."""
+def errors_of(
+    movies: list[Movie], true: np.ndarray, noise: float, *, outline: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the tensions of each movie and their standard errors, that of the outline last."""
     guess = energy_of(np.full((2, 2), 0.2), jnp.array(0.15) if outline else None)
-    fit = fit_movie(movie, guess, friction=FRICTION, noise=noise, node_friction=outline)
-    parts = [energy.terms[1] for energy in (fit.energy, fit.deviation)]
-    return tuple(np.append(x.tension, x.outline if outline else []) for x in parts)
+    results = []
+    for number, movie in enumerate(movies):
+        tracked = noisy(movie, noise, number)
+        fit = fit_movie(tracked, guess, friction=FRICTION, noise=noise, node_friction=outline)
+        energies: list[Any] = [fit.energy, fit.deviation]
+        parts = [energy.terms[1] for energy in energies]
+        results.append([np.append(x.tension, x.outline if outline else []) for x in parts])
+    values, deviations = np.swapaxes(results, 0, 1)
+    return values - true, deviations
 
 
 def print_row(name: str, errors: np.ndarray, deviations: np.ndarray) -> None:
@@ -161,28 +170,20 @@ def print_row(name: str, errors: np.ndarray, deviations: np.ndarray) -> None:
 
 def main() -> None:
     """Print all rows."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--movies", type=count, default=20)
     n_movies = parser.parse_args().movies
     warnings.simplefilter("ignore", UserWarning)
     print(f"{'':34} {'error':>8} {'s.e.':>8} {'1 s.e.':>7} {'1.96':>7}")
     times = jnp.linspace(0, 6, N_FRAMES)
-    own = [Movie(implicit(seed), times) for seed in range(n_movies)]
+    first = [Movie(implicit(seed), times) for seed in range(n_movies)]
     tables = filter(None, map(chains, itertools.count()))
-    other = [movie_from_table(table) for table in itertools.islice(tables, n_movies)]
+    second = [movie_from_table(table) for table in itertools.islice(tables, n_movies)]
     true = TABLE[np.triu_indices(2)]
     for noise in (0.0, 0.005):
-        of_movies = lambda movies, outline: map(
-            np.array,
-            zip(
-                *(fitted(noisy(movie, noise, k), noise, outline) for k, movie in enumerate(movies)),
-                strict=True,
-            ),
-        )
-        values, deviations = of_movies(own, False)
-        print_row(f"implicit, noise {noise}", values - 2 * true, deviations)
-        values, deviations = of_movies(other, True)
-        errors = values - np.append(true, OUTLINE)
+        errors, deviations = errors_of(first, 2 * true, noise, outline=False)
+        print_row(f"implicit, noise {noise}", errors, deviations)
+        errors, deviations = errors_of(second, np.append(true, OUTLINE), noise, outline=True)
         print_row(f"chains, noise {noise}", errors[:, :-1], deviations[:, :-1])
         print_row(f"chains, noise {noise}, outline", errors[:, -1], deviations[:, -1])
 

@@ -18,7 +18,7 @@ LINES = {
     "external": 2097,
     "fitting": 2025,
     "growth": 825,
-    "inference": 2180,
+    "inference": 2277,
     "initialise": 3994,
     "io": 3771,
     "jobs": 935,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2296,
     "surfaces": 630,
     "tensions": 4361,
-    "tests": 31879,
+    "tests": 31927,
     "transitions": 1327,
 }
 # Largest number of lines of a file, and of the files that have more.

@@ -58,7 +58,7 @@ def equations(
     dt: Float[Array, ""],
     used: Bool[Array, ""],
 ) -> tuple[Array, ...]:
-    """Of one step: ZᵀWr, ZᵀWG, the diagonals of ZᵀWZ and GᵀWG, and sums of squares.
+    """Of one step: ZᵀWr of each cell, ZᵀWG, the diagonals of ZᵀWZ and GᵀWG, and sums of squares.
 
     The sums are those of squared residuals and of variances by tracking, per component, and the number of
     vertices. `nodes` are those inside the edges of the last frame.
@@ -106,7 +106,10 @@ def equations(
     clean = lambda x: jnp.where(use.reshape(-1, *[1] * (x.ndim - 1)), x, 0)
     r, g, z, tracking = clean(r), clean(g), clean(z), clean(tracking)
     w = use / (tracking + floor)
-    moments = jnp.einsum("vip,v,vi->p", z, w, r)
+    # A vertex counts for its cell with the lowest number.
+    owner = jnp.min(cells, axis=1)
+    moments = jnp.einsum("vip,v,vi->vp", z, w, r)
+    moments = jnp.zeros((end.n_cells + 2, theta.size), r.dtype).at[owner].add(moments)
     slopes = jnp.einsum("vip,v,viq->pq", z, w, g)
     scales = jnp.stack([jnp.einsum("vip,v,vip->p", x, w, x) for x in (z, g)])
     squares = jnp.stack([jnp.sum(r**2) / 2, jnp.sum(tracking), jnp.sum(use).astype(r.dtype)])
@@ -136,7 +139,7 @@ def moved_nodes(
     same &= start.topology.on_outline[edges]
     before = jnp.take_along_axis(edges, jnp.argmax(same, axis=1)[:, None], axis=1)[:, 0]
     number = jnp.arange(1, most + 1)
-    fraction = number / (nodes[:, None] + 1)
+    fraction = (number / (nodes[:, None] + 1)).astype(end.vertices.dtype)
     use = jnp.any(same, axis=1) & in_start[a] & in_start[b]
     use = use[:, None] & (number <= nodes[:, None])
 
@@ -178,14 +181,24 @@ def least_share(dtype: Any) -> float:
 
 
 def sandwich_covariance(
-    moments: Float[Array, "steps parameters"],
+    moments: Float[Array, "steps cells parameters"],
     slopes: Float[Array, "parameters parameters"],
     scales: Float[Array, "2 parameters"],
     used: Bool[Array, " steps"],
 ) -> Float[Array, "parameters parameters"]:
-    """Sandwich formula over steps, with a correlation of successive steps of weight 1/2."""
-    following = moments[:-1].T @ moments[1:]
-    middle = moments.T @ moments + 0.5 * (following + following.T)
+    """Sandwich formula over steps and over cells.
+
+    Over steps with a correlation of successive ones of weight 1/2; over cells the part by which the residuals
+    of a cell have a common sign in time, as those of an error of the model.
+    """
+    of_steps, of_cells = moments.sum(axis=1), moments.sum(axis=0)
+    following = of_steps[:-1].T @ of_steps[1:]
+    middle = of_steps.T @ of_steps + 0.5 * (following + following.T)
+    independent = jnp.einsum("scp,scq->pq", moments, moments)
+    size = jnp.sqrt(jnp.where(jnp.diag(independent) > 0, jnp.diag(independent), 1))
+    size = size[:, None] * size
+    values, vectors = jnp.linalg.eigh((of_cells.T @ of_cells - independent) / size)
+    middle += (vectors * jnp.maximum(values, 0)) @ vectors.T * size
     inverse, determined = scaled_inverse(slopes, scales)
     n_steps, n_parameters = used.sum(), len(slopes)
     factor = jnp.where(

@@ -109,7 +109,8 @@ def fit_movie(
     with the tracking noise $\sigma$, the rows $\nabla\nabla E_v$ of its Hessian (estimated by random
     vectors), and a variance $s^2$ that explains the remaining residuals. Standard errors are those of the
     sandwich formula over steps, with the correlation of successive steps (Newey and West 1987,
-    doi:10.2307/1913610); they require more steps than parameters.
+    doi:10.2307/1913610), and over cells, for residuals that last (Cameron, Gelbach and Miller 2011,
+    doi:10.1198/jbes.2010.07136); they require more steps than parameters.
 
     The direction of an edge of length $\ell$ is biased by noise, by about $(\sigma / \ell)^2$. So a vertex
     counts only if its edges in frame $n - 1$ are longer than `min_edge_length` times $\sigma$; errors of that
@@ -188,8 +189,10 @@ def fit_movie(
         raise ValueError(
             f"Argument `windows` must be at most the number of steps, {n_steps}, but is {n_windows}."
         )
-    nodes = movie.outline_nodes if node_friction else None
-    if node_friction and nodes is None:
+    nodes = None
+    if node_friction and movie.outline_nodes is not None:
+        nodes = jnp.asarray(movie.outline_nodes)
+    elif node_friction:
         raise ValueError(
             "Argument `node_friction` must be False for a movie without nodes on its outline. Read the table "
             "of a free tissue by vertax.inference.movie_from_table."
@@ -241,9 +244,9 @@ def fit_movie(
     undetermined = _undetermined(names, best)
     _warn_of_long_intervals(best.theta[:, :n], change[:, :n], deviations[:, :n])
     # (The covariance of a parameter that is not determined stays as it is.)
-    known = jnp.isfinite(deviations)
-    known = known[:, :, None] & known[:, None, :]
-    covariance = best.covariance + jnp.where(known, change[:, :, None] * change[:, None, :], 0)
+    determined = jnp.isfinite(deviations)
+    determined = determined[:, :, None] & determined[:, None, :]
+    covariance = best.covariance + jnp.where(determined, change[:, :, None] * change[:, None, :], 0)
     deviations = jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2))
     in_energy = eqx.filter_vmap(settings.energy, out_axes=eqx.if_array(0))
     fits = MovieFit(
@@ -385,7 +388,7 @@ def _solve_windows(
             theta, floor, _, count, _ = carry
             of_steps = sums(theta, floor, steps, used)
             moments, slopes, scales, squares = (x.sum(axis=0) for x in of_steps)
-            step = scaled_inverse(slopes, scales)[0] @ moments
+            step = scaled_inverse(slopes, scales)[0] @ moments.sum(axis=0)
             squared, tracking, n = squares
             mean = squared / jnp.maximum(n, 1)
             excess = jnp.maximum((squared - tracking) / jnp.maximum(n, 1), 1e-3 * mean)
@@ -396,7 +399,7 @@ def _solve_windows(
 
         going = lambda carry: (carry[2] > 1e-6) & (carry[3] < max_steps)
         p, one = theta.size, jnp.ones((), theta.dtype)
-        shapes = [(p,), (p, p), (2, p), (3,)]
+        shapes = [(frames.n_cells + 2, p), (p, p), (2, p), (3,)]
         empty = tuple(jnp.zeros((len(steps), *shape), theta.dtype) for shape in shapes)
         # First with equal weights. The sums of the last step, where parameters changed by less than 1e-6,
         # also give the covariance: a second trace of the equations would double the compile time.
