@@ -1,6 +1,7 @@
 """Contents of figures."""
 
-from typing import Any, ClassVar
+import dataclasses
+from typing import Any
 
 import jax
 import matplotlib
@@ -13,6 +14,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 import vertax as vx
+from vertax.fitting import History
 from vertax.plotting import cell_polygons, plot_history, plot_recovery, plot_tissue
 
 TISSUES = {
@@ -234,7 +236,7 @@ class TestTissue:
     def test_settings_of_the_user_stay(self, tissue):
         before = dict(matplotlib.rcParams)
         plot_tissue(tissue, tissue.areas)
-        plot_history({"cost": np.ones(3)})
+        plot_recovery(np.ones(3), np.ones(3))
         assert dict(matplotlib.rcParams) == before
 
     @pytest.mark.parametrize(
@@ -316,15 +318,14 @@ class TestOverlay:
 
 
 class TestHistory:
-    HISTORY: ClassVar = {
-        "cost": np.array([1.0, 0.1, np.nan, 0.0]),
-        "max_force": np.array([1e-8, 1e-9, 1e-8, 1e-9]),
-        "num_t1": np.array([3, 0, 1, 0]),
-        "seconds": np.ones(7),
-    }
+    def history(self, cost):
+        values: Any = {field.name: np.zeros(len(cost)) for field in dataclasses.fields(History)}
+        counts = {"num_steps": np.arange(4), "num_t1": np.array([3, 0, 1, 0])}
+        values |= {"relative_error": np.full(4, np.nan), "max_force": np.full(4, 1e-8)} | counts
+        return History(**values | {"cost": cost, "converged": np.ones(4, bool)})
 
     def test_a_panel_for_each_known_curve(self):
-        panels = plot_history(self.HISTORY)
+        panels = plot_history(self.history(np.array([1.0, 0.1, np.nan, 0.0])))
         names = [panel.get_ylabel() for panel in panels]
         assert names == ["cost", "largest force", "T1 transitions"]
         assert [panel.get_yscale() for panel in panels] == ["log", "log", "linear"]
@@ -333,26 +334,8 @@ class TestHistory:
         panels[0].figure.canvas.draw()
 
     def test_negative_costs_get_a_linear_axis(self):
-        (panel,) = plot_history({"cost": np.array([1.0, -1.0])})
+        panel, *_ = plot_history(self.history(np.array([1.0, -1.0, 0.0, 1.0])))
         assert panel.get_yscale() == "linear"
-
-    def test_several_fits_in_one_figure(self):
-        panels = plot_history(self.HISTORY, label="implicit")
-        again = plot_history(self.HISTORY, axes=panels, label="EP")
-        assert again == panels
-        assert len(panels[0].lines) == 2
-        colours = {line.get_color() for line in panels[0].lines}
-        assert len(colours) == 2
-        legend: Any = panels[0].get_legend()
-        assert [text.get_text() for text in legend.get_texts()] == ["implicit", "EP"]
-
-    def test_wrong_arguments(self):
-        with pytest.raises(ValueError, match="must hold `cost`, but holds max_force"):
-            plot_history({"max_force": np.ones(3)})
-        with pytest.raises(ValueError, match="one value for each epoch"):
-            plot_history({"cost": np.ones(3), "max_force": np.ones(4)})
-        with pytest.raises(ValueError, match="`axes` must have one entry"):
-            plot_history(self.HISTORY, axes=Figure().subplots(1, 2))
 
 
 class TestRecovery:

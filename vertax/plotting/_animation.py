@@ -9,12 +9,12 @@ from typing import Any, SupportsFloat, TypeAlias
 
 import numpy as np
 from jaxtyping import Array, Bool, Real
+from matplotlib.animation import FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Colormap, to_rgb
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from PIL import Image
 
 from vertax._base.atomic import atomic_draft
 from vertax.mesh import Drawing, Tissue
@@ -80,11 +80,11 @@ def animate(
     frames = list(trajectory)
     fps, last_frame_seconds = float(fps), float(last_frame_seconds)
     _check(frames, fps, mark_t1, captions, last_frame_seconds, dpi)
-    write = _writer(path)
+    _check_path(path)
     values = _cell_values(cells, frames)
     pictures = _pictures(frames, values, Colours(cmap, vmin, vmax, label), captions, mark_t1, dpi)
     with atomic_draft(path) as draft:
-        write(draft, pictures, fps, last_frame_seconds)
+        _write(draft, pictures, fps, last_frame_seconds)
 
 
 def animate_figures(
@@ -106,7 +106,7 @@ def animate_figures(
     """
     fps, last_frame_seconds = float(fps), float(last_frame_seconds)
     _check_timing(fps, last_frame_seconds, dpi)
-    write = _writer(path)
+    _check_path(path)
     pictures = []
     for figure in figures:
         figure.set_dpi(dpi)
@@ -119,7 +119,7 @@ def animate_figures(
         for p in pictures
     )
     with atomic_draft(path) as draft:
-        write(draft, padded, fps, last_frame_seconds)
+        _write(draft, padded, fps, last_frame_seconds)
 
 
 def flipped_edges(before: Tissue, after: Tissue) -> Bool[np.ndarray, " edges"]:
@@ -276,25 +276,17 @@ def _pixels(figure: Figure) -> np.ndarray:
     return pixels[:rows, :columns].copy()
 
 
-_Write: TypeAlias = Callable[[Path, Iterator[np.ndarray], float, float], None]
+_WRITERS = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
 
-def _writer(path: str | os.PathLike[str]) -> _Write:
+def _check_path(path: str | os.PathLike[str]) -> None:
+    """Raise an error for a path that cannot be written."""
     ending = Path(path).suffix.lower()
-    writers: dict[str, _Write] = {".gif": _write_gif, ".mp4": _write_video}
-    if ending not in writers:
+    if ending not in _WRITERS:
         raise ValueError(
-            f"Argument `path` must end in {' or '.join(writers)}, but is {os.fspath(path)!r}."
+            f"Argument `path` must end in {' or '.join(_WRITERS)}, but is {os.fspath(path)!r}."
         )
-    if ending == ".mp4":
-        _check_ffmpeg()
-    return writers[ending]
-
-
-def _check_ffmpeg() -> None:
-    from matplotlib.animation import FFMpegWriter  # only videos need it
-
-    if not FFMpegWriter.isAvailable():
+    if not _WRITERS[ending].isAvailable():
         raise RuntimeError(
             "Cannot write a video: Matplotlib finds no program ffmpeg. Install ffmpeg, or set "
             'matplotlib.rcParams["animation.ffmpeg_path"] to where it is, or write a GIF (a path that ends '
@@ -302,49 +294,21 @@ def _check_ffmpeg() -> None:
         )
 
 
-def _write_gif(
+def _write(
     path: Path, pictures: Iterator[np.ndarray], fps: float, last_frame_seconds: float
 ) -> None:
-    images = [Image.fromarray(pixels) for pixels in pictures]
-    palette = _palette(images)
-    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    # The format counts in hundredths of a second, and viewers slow down frames shorter than two.
-    frame = 10 * max(2, round(100 / fps))
-    durations = [frame] * (len(images) - 1) + [frame + round(1000 * last_frame_seconds)]
-    first, *others = indexed
-    first.save(
-        path, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=True
-    )
-
-
-def _palette(images: list[Image.Image]) -> Image.Image:
-    """One palette for all frames: with one palette each, constant colours would flicker."""
-    some = [images[i] for i in np.linspace(0, len(images) - 1, min(len(images), 8)).astype(int)]
-    montage = np.concatenate([np.asarray(image) for image in some])
-    frequent = Image.fromarray(montage).quantize(250, Image.Quantize.MEDIANCUT)
-    colours = np.reshape(frequent.getpalette() or [], (-1, 3))
-    # White and the colour of marks are kept exactly; similar colours are replaced by them.
-    fixed = np.array([to_rgb("white"), to_rgb(_style.MARK)]) * 255
-    distance = np.abs(colours[:, None] - fixed).max(axis=-1).min(axis=-1)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(np.concatenate([colours[distance > 8], fixed]).astype(np.uint8).tobytes())
-    palette.load()
-    return palette
-
-
-def _write_video(
-    path: Path, pictures: Iterator[np.ndarray], fps: float, last_frame_seconds: float
-) -> None:
-    from matplotlib.animation import FFMpegWriter
-
+    """Write pictures of one size by the writers of Matplotlib."""
     first = next(pictures)
     rows, columns = first.shape[:2]
     figure = Figure(figsize=(columns / 100, rows / 100), dpi=100)
     FigureCanvasAgg(figure)
     shown = figure.figimage(first)
-    # A pixel format that every player supports.
-    rate: Any = fps  # ffmpeg takes any number
-    writer = FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "18"])
+    rate: Any = fps  # writers take any number
+    if path.suffix.lower() == ".gif":
+        writer = PillowWriter(fps=rate)
+    else:  # a pixel format that every player supports
+        options = ["-pix_fmt", "yuv420p", "-crf", "18"]
+        writer = FFMpegWriter(fps=rate, codec="h264", extra_args=options)
     with writer.saving(figure, str(path), 100):
         writer.grab_frame()
         for pixels in pictures:

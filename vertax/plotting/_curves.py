@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
-from jaxtyping import Array, Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -22,73 +19,35 @@ _CURVES = {
 }
 
 
-def plot_history(
-    history: History | Mapping[str, Real[Array | np.ndarray, " ..."]],
-    *,
-    axes: Sequence[Axes] | np.ndarray | None = None,
-    figure: Figure | None = None,
-    label: str | None = None,
-) -> list[Axes]:
-    """Draw the convergence of a fit: one panel for each curve of the history.
+def plot_history(history: History, *, figure: Figure | None = None) -> list[Axes]:
+    """Draw the convergence of a single fit: one panel for each curve of the history.
 
-    Curves are drawn on a logarithmic axis; curves with negative values or only zeros (a number of
-    transitions, for example) on a linear one. Epochs without a finite value leave a gap.
+    A cost with negative values, or only zeros, has a linear axis. Epochs without a finite value leave a gap.
 
     **Arguments:**
 
-    - `history`: of a [`Fit`][vertax.Fit], or values per epoch by name: `cost`, and optionally
-        `relative_error`, `max_force` and `num_t1`; other entries are ignored.
-    - `axes`: where to draw, one for each panel, to compare several fits; by default a new figure.
-    - `figure`: an empty figure to draw in instead; no window is opened.
-    - `label`: name of this fit in the legend.
+    - `history`: of a [`Fit`][vertax.Fit].
+    - `figure`: an empty figure to draw in, so that no window is opened; by default a new one.
 
     **Returns:** the axes of the panels.
-
-    **Raises:**
-
-    - `ValueError` if the history has no `cost`, if its curves differ in length, or if the number of
-        `axes` is not that of the panels.
     """
-    _style.one_of(axes, figure, "axes")
-    if isinstance(history, History):
-        history = history.columns()
-    if "cost" not in history:
-        raise ValueError(
-            "Argument `history` must hold `cost`, but holds "
-            f"{', '.join(map(str, history)) or 'nothing'}."
-        )
-    curves = {name: np.asarray(history[name], float) for name in _CURVES if name in history}
-    shapes = {name: curve.shape for name, curve in curves.items()}
-    if len(set(shapes.values())) > 1 or len(shapes["cost"]) != 1:
-        raise ValueError(
-            f"Argument `history` must hold one value for each epoch, but has the shapes {shapes}."
-        )
-    if axes is not None and len(axes) != len(curves):
-        raise ValueError(
-            f"Argument `axes` must have one entry for each of {', '.join(curves)}, but has "
-            f"{len(axes)}."
-        )
+    columns = history.columns()
+    curves = {name: columns[name] for name in _CURVES if name in columns}
     with _style.house_style():
-        if axes is None:
-            axes = _style.new_axes(len(curves), width=2.3, height=2.0, figure=figure)
-        panels = list(axes)
+        panels = _style.new_axes(len(curves), width=2.3, height=2.0, figure=figure)
         for panel, (name, curve) in zip(panels, curves.items(), strict=True):
-            colour = _style.SERIES[len(panel.lines) % len(_style.SERIES)]
-            epochs = np.arange(len(curve))
             title, scale = _CURVES[name]
-            logarithmic = scale == "log" and not np.any(curve < 0) and np.any(curve > 0)
-            # On a logarithmic axis zeros are gaps, like missing values.
-            values = np.where(curve > 0, curve, np.nan) if logarithmic else curve
-            # A curve of one epoch, or between two gaps, is visible only as a point.
-            few = {"marker": "o", "markersize": 2.5} if len(curve) < 15 else {}
-            panel.plot(epochs, values, color=colour, label=label, **few)
-            panel.set_yscale("log" if logarithmic else "linear")
-            if np.issubdtype(np.asarray(history[name]).dtype, np.integer):
+            if np.any(curve < 0) or not np.any(curve > 0):
+                scale = "linear"
+            # On a logarithmic axis zeros are gaps, like missing values. A curve of one epoch, or between two
+            # gaps, is visible only as a point.
+            values = np.where(curve > 0, curve, np.nan) if scale == "log" else curve
+            panel.plot(
+                values, color=_style.SERIES[0], marker="o" if len(curve) < 15 else None, ms=2.5
+            )
+            panel.set(xlabel="epoch", ylabel=title, yscale=scale)
+            if np.issubdtype(curve.dtype, np.integer):
                 panel.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
                 top = max(1.0, panel.dataLim.y1)  # with only zeros the ticks would be fractions
                 panel.set_ylim(-0.03 * top, 1.05 * top)
-            panel.set_xlabel("epoch")
-            panel.set_ylabel(title)
-        if label is not None:
-            panels[0].legend()
     return panels
