@@ -26,7 +26,7 @@ def fitted_noise(parameters: Any) -> Any:
 def scan(
     folder: runs.RunFolder,
     name: str,
-    values: Sequence[float],
+    values: Sequence[float] | range,
     compute: Callable[[float], dict[str, np.ndarray]],
     *,
     progress: bool = True,

@@ -16,12 +16,13 @@ from helpers import (
     random_tissue,
     relaxed,
 )
+from jaxtyping import Array, Float
 
 import vertax as vx
 from vertax.costs import Frames, VertexDistance
 from vertax.dissipations import SubstrateFriction
 from vertax.dynamics import Material
-from vertax.energies import ShapeFactorEnergy
+from vertax.energies import LineTension, ShapeFactorEnergy
 
 CELLS = 6
 TIMES = (0.0, 0.2, 0.5)
@@ -121,3 +122,17 @@ class TestInvalidInput:
             Material(ShapeFactorEnergy(3.5), 1.0)  # pyright: ignore[reportArgumentType]
         with pytest.raises(TypeError, match="function of time"):
             Material(lambda time: ShapeFactorEnergy(3.5))(random_tissue(CELLS))
+
+    def test_an_energy_in_time_may_have_a_row_of_one_entry_per_edge(self):
+        class Schedule(eqx.Module):
+            tensions: Float[Array, "knots edges"]
+
+            def __call__(self, time):
+                return LineTension(self.tensions[0] * time)
+
+        tissue = random_tissue(CELLS)
+        material = Material(Schedule(jnp.ones((1, tissue.n_edges))), SubstrateFriction(1.0))
+        cost = vx.costs.VertexDistance(tissue)
+        response = vx.Evolution(SubstrateFriction(1.0), [0.0, 0.1])
+        problem = vx.InverseProblem(tissue, material, cost, response=response)
+        assert problem.energy is material

@@ -58,7 +58,10 @@ def warn_of_outer_products(module: Any, counts: Mapping[str, int], *arguments: A
         if not items or shape not in ((n, 1), (1, n)):
             continue
         # (The trace takes longer than the rest, but it is rare.)
-        trace, *_ = eqx.filter_make_jaxpr(lambda f, *x: f(*x))(module, *arguments)
+        try:
+            trace, *_ = eqx.filter_make_jaxpr(lambda f, *x: f(*x))(module, *arguments)
+        except Exception:  # of a function of time, or of a faulty one, which the computation states
+            return
         if f"[{n},{n}]" in str(trace):
             warnings.warn(
                 f"Field {name} has the shape {shape}, and its product with an array of one entry per "

@@ -139,11 +139,20 @@ def solve(
     """Solve a symmetric system given by its matrix-vector product; NaN if solver and fallback fail."""
     structure = jax.eval_shape(lambda: rhs)
     operator = lx.FunctionLinearOperator(product, structure, tags=lx.symmetric_tag)
-    solution = lx.linear_solve(operator, rhs, solver, throw=False)
-    successful = solution.result == lx.RESULTS.successful
-    nan = lambda: jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rhs)
-    retry = nan if fallback is None else lambda: solve(product, rhs, fallback)
-    return jax.lax.cond(successful, lambda: solution.value, retry)
+
+    def attempt(vector: PyTree[Array], *solvers: lx.AbstractLinearSolver) -> PyTree[Array]:
+        if not solvers:
+            return jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), vector)
+        first, *others = solvers
+        solution, result, _ = first.compute(first.init(operator, {}), vector, {})
+        retry = lambda: attempt(vector, *others)
+        return jax.lax.cond(result == lx.RESULTS.successful, lambda: solution, retry)
+
+    solvers = (solver,) if fallback is None else (solver, fallback)
+    # (`lineax.linear_solve` has a callback to Python: derivatives could not be stored in a cache.)
+    return jax.lax.custom_linear_solve(
+        product, rhs, lambda _, vector: attempt(vector, *solvers), symmetric=True
+    )
 
 
 # A modulus is the minimum over motions u of a quadratic form q(θ, u), and an eigenvalue a stationary value of
