@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import PyTree, Shaped
 
 from vertax._base.processes import ProcessDied, ProcessKilled, run_in_process
+from vertax._base.tasks import map_tasks
 from vertax.external._simulator import AbstractSimulator, Relaxed, SimulatorError, ledger_of
 from vertax.mesh import Tissue
 
@@ -101,26 +102,23 @@ def run_jobs(
 
     With `processes` each job is killed after `timeout` seconds.
     """
+    results: list[Result | None] = [None] * len(requests)
     reasons: list[SimulatorError] = []
 
-    def one(job: Job) -> Result | None:
-        try:
-            with ledger_of(job.simulator).run():
-                return _in_process(job, timeout) if processes else job()
-        except Exception as error:
-            reasons.append(_as_error(error))
-            return None
+    def one(number: int) -> Result:
+        job = requests[number]
+        with ledger_of(job.simulator).run():
+            return _in_process(job, timeout) if processes else job()
 
     # Requests with NaN, for example from a relaxation that failed before, are not run.
     is_finite = [all(map(_finite, jax.tree.leaves(job.request))) for job in requests]
-    valid_jobs = [job for job, ok in zip(requests, is_finite, strict=True) if ok]
-    if min(len(valid_jobs), workers) > 1:
-        with ThreadPoolExecutor(min(len(valid_jobs), workers)) as pool:
-            results = list(pool.map(one, valid_jobs))
-    else:
-        results = [one(job) for job in valid_jobs]
-    remaining = iter(results)
-    return [next(remaining) if ok else None for ok in is_finite], reasons[0] if reasons else None
+    numbers = [number for number, finite in enumerate(is_finite) if finite]
+    with ThreadPoolExecutor(max(1, min(len(numbers), workers))) as pool:
+        for place, result, error in map_tasks(one, numbers, executor=pool, progress=False):
+            results[numbers[place]] = result
+            if error is not None:
+                reasons.append(_as_error(error))
+    return results, reasons[0] if reasons else None
 
 
 def stack_results(
