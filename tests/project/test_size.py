@@ -18,7 +18,7 @@ LINES = {
     "external": 2095,
     "fitting": 2025,
     "growth": 825,
-    "inference": 2277,
+    "inference": 2296,
     "initialise": 3994,
     "io": 3771,
     "jobs": 935,

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse.csgraph import connected_components
 
 from vertax._base.announce import announce_compilations, announced_jit
 from vertax._base.batch import member
@@ -24,12 +19,18 @@ from vertax.inference._movie_equations import (
     Settings,
     equations,
     frame_at,
-    least_share,
     sandwich_covariance,
     scaled_inverse,
 )
+from vertax.inference._movie_warnings import (
+    Solution,
+    names_of,
+    undetermined_in,
+    warn_of_long_intervals,
+    warn_of_straight_outlines,
+)
 from vertax.inference._tracking_noise import tracking_noise
-from vertax.mesh import Free, Tissue
+from vertax.mesh import Tissue
 
 
 class MovieFit(eqx.Module):
@@ -61,18 +62,6 @@ class MovieFit(eqx.Module):
     undetermined: tuple[str, ...] = eqx.field(static=True)
     """Parameters that the movie does not determine, by name, such as `"terms[1].outline"`; several with `+`
     if it does not determine them together. With windows, those of any window."""
-
-
-class _Solution(NamedTuple):
-    """Parameters of each window, and how well they are determined."""
-
-    theta: Float[Array, "windows parameters"]
-    covariance: Float[Array, "windows parameters parameters"]
-    misfit: Float[Array, " windows"]
-    num_equations: Int[Array, " windows"]
-    converged: Bool[Array, " windows"]
-    slopes: Float[Array, "windows parameters parameters"]
-    scales: Float[Array, "windows 2 parameters"]
 
 
 def fit_movie(
@@ -219,7 +208,7 @@ def fit_movie(
         outline=outline,
         most_nodes=0 if nodes is None else int(nodes.max()),
     )
-    _warn_of_straight_outlines(movie.tissue, outline)
+    warn_of_straight_outlines(movie.tissue, outline)
     parts = np.array_split(np.arange(n_steps), n_windows)
     steps = jnp.asarray([np.resize(part, len(parts[0])) for part in parts])
     used = jnp.asarray([np.arange(len(parts[0])) < len(part) for part in parts])
@@ -240,9 +229,9 @@ def fit_movie(
     deviations = jnp.sqrt(jnp.diagonal(best.covariance, axis1=1, axis2=2))
     change = compared.theta - best.theta
     n = theta.size - fit_friction
-    names = [*_names(parameters), *["friction"] * fit_friction]
-    undetermined = _undetermined(names, best)
-    _warn_of_long_intervals(best.theta[:, :n], change[:, :n], deviations[:, :n])
+    names = [*names_of(parameters), *["friction"] * fit_friction]
+    undetermined = undetermined_in(names, best)
+    warn_of_long_intervals(best.theta[:, :n], change[:, :n], deviations[:, :n])
     # (The covariance of a parameter that is not determined stays as it is.)
     determined = jnp.isfinite(deviations)
     determined = determined[:, :, None] & determined[:, None, :]
@@ -265,100 +254,6 @@ def fit_movie(
     return fits if windows is not None else member(fits, 0)
 
 
-def _warn_of_straight_outlines(frames: Tissue, outline: bool) -> None:
-    """Warn if outer cells are used but have straight outer sides, as tables of corners have."""
-    angles = eqx.filter_vmap(lambda tissue: tissue.angles)(frames)
-    straight = angles is None or not jnp.any(jnp.abs(angles) > 1e-6)
-    if outline and straight and isinstance(frames.boundary, Free):
-        warnings.warn(
-            "All sides on the outline are straight, so the pressure of outer cells is unknown. Include "
-            "points along these sides in the table, or pass `outline=False`.",
-            stacklevel=3,
-        )
-
-
-def _names(parameters: AbstractEnergy) -> list[str]:
-    """The name of each entry of each parameter, in the order of the fit."""
-    names = []
-    for path, array in jax.tree_util.tree_flatten_with_path(parameters)[0]:
-        name = jax.tree_util.keystr(path).lstrip(".")
-        entries = [f"[{', '.join(map(str, index))}]" for index in np.ndindex(array.shape)]
-        names += [name + (entry if array.ndim else "") for entry in entries]
-    return names
-
-
-def _undetermined(names: list[str], solution: _Solution) -> tuple[str, ...]:
-    """Names of what the movie does not determine; a warning for that, and for what it hardly determines."""
-    free: dict[str, None] = {}
-    weak: dict[str, float] = {}
-    for slopes, scales, theta, covariance in zip(
-        *map(np.asarray, (solution.slopes, solution.scales, solution.theta, solution.covariance)),
-        strict=True,
-    ):
-        size = np.sqrt(np.where(scales > 0, scales, 1))
-        inverse, _ = scaled_inverse(jnp.asarray(slopes), jnp.asarray(scales))
-        # The projection on directions in which the scaled information is 0.
-        null = np.eye(len(theta)) - (np.asarray(inverse) @ slopes) * size[1][:, None] / size[1]
-        least = least_share(slopes.dtype)
-        group = connected_components(np.abs(null) > least, directed=False)[1]
-        for k in np.unique(group[np.diag(null) > least]):
-            free["+".join(names[i] for i in np.flatnonzero(group == k))] = None
-        # Eigenvectors of the covariance of relative errors.
-        fixed = np.flatnonzero(np.isfinite(np.diag(covariance)) & (theta != 0))
-        relative = covariance[np.ix_(fixed, fixed)] / theta[fixed] / theta[fixed, None]
-        variance, vectors = np.linalg.eigh(relative)
-        for value, vector in zip(variance, vectors.T, strict=True):
-            if value > _LARGEST_ERROR**2:
-                parts = fixed[np.abs(vector) > 0.3]
-                weak["+".join(names[i] for i in parts)] = float(np.sqrt(value))
-    if free:
-        warnings.warn(
-            f"The movie does not determine {_list(free)} (`undetermined`): these have infinite standard "
-            "errors, and depend on the guess. Give a known value as a number instead of an array, or use "
-            "more of the tissue.",
-            stacklevel=3,
-        )
-    if weak:
-        warnings.warn(
-            "The movie hardly determines these parameters together: "
-            f"{_list({f'{name} (relative error {error:.2g})': 0 for name, error in weak.items()})}. Give a "
-            "known value as a number instead of an array, or more frames in shorter intervals.",
-            stacklevel=3,
-        )
-    if np.isnan(solution.covariance).any():
-        warnings.warn(
-            f"Standard errors are NaN: they require more steps than parameters, {len(names)}.",
-            stacklevel=3,
-        )
-    return tuple(free)
-
-
-def _list(names: Iterable[str]) -> str:
-    names = list(names)
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-_LARGEST_ERROR = 0.5
-"""Standard error of a combination of parameters, relative to them, that is hardly determined."""
-
-
-def _warn_of_long_intervals(
-    theta: Float[Array, "windows parameters"],
-    change: Float[Array, "windows parameters"],
-    deviations: Float[Array, "windows parameters"],
-) -> None:
-    """Warn if a parameter changes by more than 3 standard errors and 5 % with the other implicitness."""
-    large = jnp.abs(change) > jnp.maximum(3 * deviations, 0.05 * jnp.abs(theta))
-    if jnp.any(large):
-        ratio = jnp.max(jnp.where(deviations > 0, jnp.abs(change) / deviations, 0))
-        warnings.warn(
-            "Frames are too far apart: with the other `implicitness` parameters change by up to "
-            f"{float(ratio):.2g} standard errors (`interval_error`). Take frames in shorter "
-            "intervals, or only those after fast changes.",
-            stacklevel=3,
-        )
-
-
 @announced_jit
 def _solve_windows(
     frames: Tissue,
@@ -369,7 +264,7 @@ def _solve_windows(
     steps: Int[Array, "windows steps"],
     used: Bool[Array, "windows steps"],
     max_steps: int,
-) -> _Solution:
+) -> Solution:
     """The solution in each window."""
 
     def sums(theta: Array, floor: Array, steps: Array, used: Array) -> tuple[Array, ...]:
@@ -383,7 +278,7 @@ def _solve_windows(
 
         return jax.lax.map(one, (steps, used))
 
-    def solve(steps: Array, used: Array) -> _Solution:
+    def solve(steps: Array, used: Array) -> Solution:
         def newton(carry: tuple) -> tuple:
             theta, floor, _, count, _ = carry
             of_steps = sums(theta, floor, steps, used)
@@ -408,7 +303,7 @@ def _solve_windows(
         moments, slopes, scales, squares = of_steps
         covariance = sandwich_covariance(moments, slopes.sum(axis=0), scales.sum(axis=0), used)
         n = jnp.maximum(squares[:, 2].sum(), 1)
-        return _Solution(
+        return Solution(
             theta=best,
             covariance=covariance,
             misfit=jnp.sqrt(squares[:, 0].sum() / n),
