@@ -12,8 +12,9 @@ from jaxtyping import ArrayLike, Float, Int
 from vertax._base.checks import as_float64, check_number
 from vertax.inference._movie import Movie, Repair
 from vertax.inference._movie_polygons import Numbering, Polygons, check_given, polygons_of
+from vertax.initialise import PolygonTissue
 from vertax.initialise._nearby_corners import SharedCorners, build_within, share_corners
-from vertax.initialise._polygons import PolygonTissue, checked_lattice, tissue_from_corners
+from vertax.initialise._polygons import checked_lattice, tissue_from_corners
 from vertax.io import read_table
 from vertax.io._read_table import column, whole_numbers
 
