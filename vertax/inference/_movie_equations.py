@@ -154,8 +154,7 @@ def moved_nodes(
 
     after = places(end, jnp.stack([a, b]), end.edge_angles)
     moved = jnp.where(use, after - places(start, ends, start.edge_angles[before]), 0)
-    z = jnp.conj(weights(end.edge_angles))
-    sums = jnp.zeros(end.n_vertices, moved.dtype)
+    z, sums = jnp.conj(weights(end.edge_angles)), jnp.zeros(end.n_vertices, moved.dtype)
     sums = sums.at[a].add(((1 - z) * moved).sum(axis=1)).at[b].add((z * moved).sum(axis=1))
     return jnp.stack([sums.real, sums.imag], axis=-1)
 
