@@ -57,10 +57,8 @@ def test_cells_divide_and_the_tissue_stays_valid(grown):
 
 @pytest.mark.thorough
 def test_a_growth_with_a_checkpoint_continues(tmp_path):
-    """One function, frame by frame, and a shorter run that is continued give the same growth."""
-
-    def run(n, **settings):
-        cycle, times = GrowAndDivide(0.2, 1.5), jnp.linspace(0, 4, 6)[:n]
+    def run(n, rate=0.2, **settings):
+        cycle, times = GrowAndDivide(rate, 1.5), jnp.linspace(0, 4, 6)[:n]
         return grow(
             founders(), energy_of, cycle, times, key=1, relaxation=FIXED_TOPOLOGY, **settings
         )
@@ -74,15 +72,7 @@ def test_a_growth_with_a_checkpoint_continues(tmp_path):
     np.testing.assert_allclose(at_once.frames.vertices, continued.frames.vertices, atol=1e-7)
     np.testing.assert_allclose(at_once.cells_then.age, continued.cells_then.age, atol=1e-12)
     with pytest.raises(ValueError, match="checkpoint of a growth with another tissue, energy or"):
-        grow(
-            founders(),
-            energy_of,
-            GrowAndDivide(0.3, 1.5),
-            jnp.linspace(0, 4, 6),
-            key=1,
-            relaxation=FIXED_TOPOLOGY,
-            checkpoint=file,
-        )
+        run(6, rate=0.3, checkpoint=file)
 
 
 @pytest.mark.thorough

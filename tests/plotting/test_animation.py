@@ -75,6 +75,12 @@ def test_a_gif_has_a_picture_for_each_frame_and_marks_transitions(way, tmp_path)
     assert corners == {(255, 255, 255)}
 
 
+def test_frames_of_a_gif_are_not_shorter_than_viewers_show(way, tmp_path):
+    values = np.linspace(0, 1, 4 * 8).reshape(4, 8)
+    vx.animate(way, tmp_path / "fast.gif", values, fps=200, last_frame_seconds=0.1, dpi=60)
+    assert frames_of(tmp_path / "fast.gif")[1] == [20, 20, 20, 120]
+
+
 def test_colour_bar_shows_values_beyond_its_limits(way, tmp_path, monkeypatch):
     bars = []
     keep = lambda *args, **options: bars.append(add_bar(*args, **options))

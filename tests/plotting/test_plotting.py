@@ -319,10 +319,11 @@ class TestOverlay:
 
 class TestHistory:
     def history(self, cost):
-        values: Any = {field.name: np.zeros(len(cost)) for field in dataclasses.fields(History)}
-        counts = {"num_steps": np.arange(4), "num_t1": np.array([3, 0, 1, 0])}
-        values |= {"relative_error": np.full(4, np.nan), "max_force": np.full(4, 1e-8)} | counts
-        return History(**values | {"cost": cost, "converged": np.ones(4, bool)})
+        values: Any = {field.name: 0 * cost for field in dataclasses.fields(History)}
+        counts = np.resize([3, 0, 1, 0], cost.shape)
+        values |= {"seconds": np.ones(4), "guidance": np.ones(4), "converged": counts >= 0}
+        values |= {"relative_error": np.nan * cost, "max_force": 1e-8 + 0 * counts}
+        return History(**values | {"cost": cost, "num_steps": counts, "num_t1": counts})
 
     def test_a_panel_for_each_known_curve(self):
         panels = plot_history(self.history(np.array([1.0, 0.1, np.nan, 0.0])))
@@ -336,6 +337,10 @@ class TestHistory:
     def test_negative_costs_get_a_linear_axis(self):
         panel, *_ = plot_history(self.history(np.array([1.0, -1.0, 0.0, 1.0])))
         assert panel.get_yscale() == "linear"
+
+    def test_the_history_of_a_batch_is_refused(self):
+        with pytest.raises(ValueError, match=r"`history` must have shape \(4,\), but has \(4, 2\)"):
+            plot_history(self.history(np.ones((4, 2))))
 
 
 class TestRecovery:

@@ -7,7 +7,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 # Largest numbers of lines of Python, with comments and docstrings.
 LINES = {
-    "_base": 3216,
+    "_base": 3214,
     "activities": 436,
     "adjoints": 988,
     "bayes": 1090,
@@ -18,11 +18,11 @@ LINES = {
     "external": 2095,
     "fitting": 2025,
     "growth": 825,
-    "inference": 2296,
+    "inference": 2295,
     "initialise": 3994,
     "io": 3771,
     "jobs": 935,
-    "mechanics": 2258,
+    "mechanics": 2251,
     "mesh": 2933,
     "plotting": 2168,
     "precondition": 716,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2296,
     "surfaces": 630,
     "tensions": 4361,
-    "tests": 31925,
+    "tests": 31924,
     "transitions": 1327,
 }
 # Largest number of lines of a file, and of the files that have more.

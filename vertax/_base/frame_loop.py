@@ -162,8 +162,9 @@ def _by_frames(
                 _joined(simulation, points[: number + 1], state, rows, first).checked()
             reached = Progress(state, rows)
             bar.set_description(refresh=False)
-            counts = {name: int(count) for name, count in simulation.counts(state).items()}
-            bar.set_postfix({simulation.points[:-1]: f"{numbers[number]:g}"} | counts)
+            if not bar.disable:
+                counts = {name: int(count) for name, count in simulation.counts(state).items()}
+                bar.set_postfix({simulation.points[:-1]: f"{numbers[number]:g}"} | counts)
             bar.update()
             file.save_if_due(reached)
     except KeyboardInterrupt:
@@ -243,10 +244,7 @@ def check_points(
     stored: np.ndarray,
     points: np.ndarray,
 ) -> None:
-    """Raise an error unless the points of a checkpoint are the first ones of a run, up to rounding.
-
-    (`simulation` is an `AbstractSimulation`, or such a class.)
-    """
+    """Raise an error unless the points of a checkpoint are the first ones of a run, up to rounding."""
     common = min(len(stored), len(points))
     differences = np.abs(stored[:common] - points[:common])
     # The same time computed in two ways, such as 3 * 0.1 and 0.3, differs by units in the last place.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,6 +42,18 @@ class Settings(eqx.Module):
     ) -> Float[Array, "vertices 2"]:
         energy = self.energy(theta)
         return jax.grad(lambda x: energy(tissue.with_vertices(x)))(tissue.vertices)
+
+
+class Solution(NamedTuple):
+    """Parameters of each window, and how well they are determined."""
+
+    theta: Float[Array, "windows parameters"]
+    covariance: Float[Array, "windows parameters parameters"]
+    misfit: Float[Array, " windows"]
+    num_equations: Int[Array, " windows"]
+    converged: Bool[Array, " windows"]
+    slopes: Float[Array, "windows parameters parameters"]
+    scales: Float[Array, "windows 2 parameters"]
 
 
 def frame_at(frames: Tissue, number: Int[Array, ""]) -> Tissue:

@@ -17,13 +17,13 @@ from vertax.energies import AbstractEnergy
 from vertax.inference._movie import Movie
 from vertax.inference._movie_equations import (
     Settings,
+    Solution,
     equations,
     frame_at,
     sandwich_covariance,
     scaled_inverse,
 )
 from vertax.inference._movie_warnings import (
-    Solution,
     names_of,
     undetermined_in,
     warn_of_long_intervals,

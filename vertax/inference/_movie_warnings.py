@@ -4,30 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 from scipy.sparse.csgraph import connected_components
 
 from vertax.energies import AbstractEnergy
-from vertax.inference._movie_equations import least_share, scaled_inverse
+from vertax.inference._movie_equations import Solution, least_share, scaled_inverse
 from vertax.mesh import Free, Tissue
-
-
-class Solution(NamedTuple):
-    """Parameters of each window, and how well they are determined."""
-
-    theta: Float[Array, "windows parameters"]
-    covariance: Float[Array, "windows parameters parameters"]
-    misfit: Float[Array, " windows"]
-    num_equations: Int[Array, " windows"]
-    converged: Bool[Array, " windows"]
-    slopes: Float[Array, "windows parameters parameters"]
-    scales: Float[Array, "windows 2 parameters"]
 
 
 def warn_of_straight_outlines(frames: Tissue, outline: bool) -> None:

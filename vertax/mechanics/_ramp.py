@@ -164,12 +164,7 @@ def ramp(
     points = jnp.concatenate([jnp.zeros_like(values[:1]), values])
     with announce_compilations(f"the deformation of {tissue.n_cells} cells"):
         return simulate(
-            simulation,
-            tissue,
-            points,
-            progress=progress,
-            checkpoint=checkpoint,
-            throw=throw,
+            simulation, None, points, progress=progress, checkpoint=checkpoint, throw=throw
         )
 
 
@@ -189,21 +184,19 @@ class _Deformation(AbstractSimulation):
     relaxation: Relaxation
     adjoint: AbstractAdjoint
 
-    def begin(self, start: Tissue, points: Array) -> tuple[_State, Frame]:
-        zero, count = jnp.zeros((), points.dtype), jnp.array(0)
-        state = _State(start, count, result_of(count))
-        return state, _frame(start, zero, jnp.zeros((2, 2), points.dtype), count, state.result)
+    def begin(self, start: None, points: Array) -> tuple[_State, Frame]:
+        zero, count = jnp.zeros((2, 2), points.dtype), jnp.array(0)
+        state = _State(self.initial, count, result_of(count))
+        return state, _frame(self.initial, zero[0, 0], zero, count, state.result)
 
     def advance(self, state: _State, interval: Array, key: Any) -> tuple[_State, Frame]:
         box = deformed(self.initial, self.deformation(interval[1])).boundary
         rest = self.relaxation.solve(
             state.tissue.carried(box), self.energy, self.adjoint, recompute=True
         )
-        stresses, result = (
-            stress(rest.tissue, self.energy),
-            first_failure(state.result, rest.result),
-        )
+        stresses = stress(rest.tissue, self.energy)
         frame = _frame(rest.tissue, rest.energy, stresses, rest.num_t1, rest.result)
+        result = first_failure(state.result, rest.result)
         return _State(rest.tissue, state.num_t1 + rest.num_t1, result), frame
 
     def outcome(self, points: Array, end: _State, frames: Frame) -> Ramp:
@@ -215,5 +208,5 @@ class _Deformation(AbstractSimulation):
 
 
 def _frame(tissue: Tissue, energy: Array, stresses: Array, num_t1: Array, result: RESULTS) -> Frame:
-    names = ("frames", "energies", "stresses", "num_t1", "results")
-    return dict(zip(names, (tissue, energy, stresses, num_t1, result), strict=True))
+    values = {"energies": energy, "stresses": stresses, "num_t1": num_t1}
+    return {"frames": tissue, "results": result} | values

@@ -263,7 +263,6 @@ def _figure(extent: np.ndarray, bar: bool, caption: bool, dpi: int) -> tuple[Fig
     layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04)
     size = (width + 0.8 * bar + 0.1, height + 0.25 * caption + 0.1)
     figure = Figure(figsize=size, dpi=dpi, layout=layout)
-    FigureCanvasAgg(figure)
     return figure, figure.subplots()
 
 
@@ -298,21 +297,19 @@ def _write(
     path: Path, pictures: Iterator[np.ndarray], fps: float, last_frame_seconds: float
 ) -> None:
     """Write pictures of one size by the writers of Matplotlib."""
-    first = next(pictures)
-    rows, columns = first.shape[:2]
+    rows, columns = (first := next(pictures)).shape[:2]
     figure = Figure(figsize=(columns / 100, rows / 100), dpi=100)
-    FigureCanvasAgg(figure)
     shown = figure.figimage(first)
-    rate: Any = fps  # writers take any number
-    if path.suffix.lower() == ".gif":
-        writer = PillowWriter(fps=rate)
-    else:  # a pixel format that every player supports
-        options = ["-pix_fmt", "yuv420p", "-crf", "18"]
-        writer = FFMpegWriter(fps=rate, codec="h264", extra_args=options)
+    gif = path.suffix.lower() == ".gif"
+    # Viewers slow down frames of a GIF that are shorter than two hundredths of a second.
+    rate: Any = min(fps, 50) if gif else fps
+    # A pixel format that every player supports.
+    video: Any = {"codec": "h264", "extra_args": ["-pix_fmt", "yuv420p", "-crf", "18"]}
+    writer = PillowWriter(fps=rate) if gif else FFMpegWriter(fps=rate, **video)
     with writer.saving(figure, str(path), 100):
         writer.grab_frame()
         for pixels in pictures:
             shown.set_data(pixels)
             writer.grab_frame()
-        for _ in range(round(last_frame_seconds * fps)):
+        for _ in range(round(last_frame_seconds * rate)):
             writer.grab_frame()

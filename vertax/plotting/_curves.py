@@ -9,6 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from vertax.fitting import History
 from vertax.plotting import _style
+from vertax.plotting._tissue import checked
 
 # Columns of a history in the order of the panels, with title and scale of the axis.
 _CURVES = {
@@ -30,7 +31,10 @@ def plot_history(history: History, *, figure: Figure | None = None) -> list[Axes
     - `figure`: an empty figure to draw in, so that no window is opened; by default a new one.
 
     **Returns:** the axes of the panels.
+
+    **Raises:** `ValueError` for the history of a batch: take that of a member.
     """
+    checked("history", history.cost, len(history.cost))
     columns = history.columns()
     curves = {name: columns[name] for name in _CURVES if name in columns}
     with _style.house_style():
@@ -39,8 +43,7 @@ def plot_history(history: History, *, figure: Figure | None = None) -> list[Axes
             title, scale = _CURVES[name]
             if np.any(curve < 0) or not np.any(curve > 0):
                 scale = "linear"
-            # On a logarithmic axis zeros are gaps, like missing values. A curve of one epoch, or between two
-            # gaps, is visible only as a point.
+            # On a logarithmic axis zeros are gaps. A curve of one epoch, or between two gaps, is a point.
             values = np.where(curve > 0, curve, np.nan) if scale == "log" else curve
             panel.plot(
                 values, color=_style.SERIES[0], marker="o" if len(curve) < 15 else None, ms=2.5
