@@ -214,7 +214,7 @@ class TestSelfPropulsion:
     def test_invalid_arguments_are_rejected(self):
         with pytest.raises(ValueError, match="`force`"):
             SelfPropulsion(-1.0)
-        with pytest.raises(ValueError, match="one entry per cell"):
+        with pytest.raises(ValueError, match="one for each cell"):
             evolve(SelfPropulsion(jnp.ones(5)), [0.0, 1.0])
 
 

@@ -131,9 +131,9 @@ def test_invalid_arguments_of_costs_are_rejected(make, error, message):
 @pytest.mark.parametrize("make", [costs.VertexDistance, costs.EdgeDistance, costs.CentroidDistance])
 def test_batches_and_targets_of_another_boundary_are_rejected(make, tissue, free, batch):
     energy = vx.energies.ShapeFactorEnergy(3.7)
-    with pytest.raises(ValueError, match="must compare a single tissue with a single target"):
+    with pytest.raises(ValueError, match="`target` must be a single tissue"):
         make(batch)(tissue, energy)
-    with pytest.raises(ValueError, match="must compare a single tissue with a single target"):
+    with pytest.raises(ValueError, match="`tissue` must be a single tissue"):
         make(tissue)(batch, energy)
     if make is costs.CentroidDistance:
         with pytest.raises(ValueError, match="boundary of the tissue, Periodic, but has Free"):

@@ -204,7 +204,7 @@ def test_invalid_images_are_rejected(arguments, message):
 
 
 def test_invalid_options_of_image_costs_are_rejected():
-    with pytest.raises(ValueError, match="`weight` must have the shape"):
+    with pytest.raises(ValueError, match="`weight` must have shape"):
         MeshImage(np.eye(64), 0.1, weight=np.ones((3, 3)))
     with pytest.raises(ValueError, match="`weight` must be at least 0"):
         MeshImage(np.eye(64), 0.1, weight=-np.ones((64, 64)))

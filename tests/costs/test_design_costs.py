@@ -45,7 +45,7 @@ def test_cell_costs_match_their_formulas():
         0.5 * float(jnp.mean((tissue.areas - 1.2) ** 2))
     )
     assert CellAreas(tissue.areas)(tissue, energy) == 0
-    with pytest.raises(ValueError, match=r"CellAreas must be .*\(9,\)"):
+    with pytest.raises(ValueError, match=r"`target` must be one number or .*\(9,\)"):
         CellAreas(jnp.ones(4))(tissue, energy)
 
 

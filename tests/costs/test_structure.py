@@ -34,7 +34,7 @@ from vertax.costs import (
 )
 from vertax.costs._positions import matching_vertices
 from vertax.costs._transport import entropic_transport, transport_plan
-from vertax.mesh._topology import flip_edges
+from vertax.transitions._euler_operators import flip_edges
 
 energy = vx.energies.ShapeFactorEnergy(3.7)
 

@@ -96,7 +96,7 @@ def test_invalid_arguments_are_rejected(without_type_checks):
     for kind in (SubstrateFriction, EdgeViscosity, PerimeterViscosity, AreaViscosity):
         with pytest.raises(ValueError, match="must be at least 0"):
             kind(-1.0)
-        with pytest.raises(ValueError, match="one entry for each"):
+        with pytest.raises(ValueError, match="one for each"):
             kind(jnp.ones(5))(tissue, before, 1.0)
     with pytest.raises(ValueError, match="`per`"):
         SubstrateFriction(1.0, per="cell")  # pyright: ignore[reportArgumentType]

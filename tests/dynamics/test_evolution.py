@@ -390,7 +390,7 @@ class TestErrors:
 
         with pytest.raises(ValueError, match="sum of squares"):
             vx.Evolution(CustomDissipation(), [0.0, 1.0], order=2)
-        with pytest.raises(ValueError, match="`order` must be 1 or 2"):
+        with pytest.raises(ValueError, match="`order` must be one of 1, 2"):
             vx.Evolution(FRICTION, [0.0, 1.0], order=3)
         with pytest.raises(ValueError, match="`substeps` must be at least 1"):
             vx.Evolution(FRICTION, [0.0, 1.0], substeps=0)

@@ -13,9 +13,9 @@ from vertax.dynamics import evolve
 from vertax.dynamics._incremental_potential import IncrementalPotential, with_flips_of
 from vertax.energies import ShapeFactorEnergy
 from vertax.initialise import periodic_voronoi
-from vertax.mesh._topology import flip_edges
 from vertax.relax import Relaxation
 from vertax.transitions._edge_frames import EdgeFrames
+from vertax.transitions._euler_operators import flip_edges
 
 
 def with_flip(tissue, number):

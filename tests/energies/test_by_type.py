@@ -102,7 +102,7 @@ def test_entries_are_the_parameters():
         ([[1.0, 2.0], [3.0, 4.0]], TYPES, None, "`table` must be symmetric"),
         (TABLE, TYPES.astype(float), None, "`types` must hold one integer"),
         (TABLE, TYPES.at[5].set(2), None, "cell 5 has the type 2"),
-        (TABLE, TYPES, [1.0, 2.0, 3.0], "`outline` must be a scalar"),
+        (TABLE, TYPES, [1.0, 2.0, 3.0], "`outline` must be one number"),
     ],
 )
 def test_wrong_arguments_are_named(table, types, outline, message):
@@ -111,7 +111,7 @@ def test_wrong_arguments_are_named(table, types, outline, message):
 
 
 def test_wrong_tissues_are_named():
-    with pytest.raises(ValueError, match="`types` must have one entry per cell"):
+    with pytest.raises(ValueError, match="`types` must have shape"):
         by_type(TABLE, TYPES[:-1])(tissue)
     with pytest.raises(ValueError, match="`outline` must be a tension"):
         by_type(TABLE, TYPES)(free)

@@ -19,7 +19,7 @@ from vertax.external._evolver_model import Terms, parameter_derivatives
 from vertax.external._evolver_strings import Strings
 from vertax.external._evolver_t1 import can_flip, flip_edge
 from vertax.external._simulator import Relaxed
-from vertax.mesh._topology import flip_edges
+from vertax.transitions._euler_operators import flip_edges
 
 needs_evolver = pytest.mark.skipif(
     shutil.which("evolver") is None,

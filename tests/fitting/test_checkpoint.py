@@ -311,5 +311,5 @@ def test_notes_with_changing_names_are_rejected():
 
 
 def test_negative_checkpoint_interval_is_rejected(path):
-    with pytest.raises(ValueError, match="`every` must not be negative"):
+    with pytest.raises(ValueError, match="`every` must be at least 0"):
         vx.Checkpoint(path, every=-1)

@@ -118,7 +118,7 @@ class TestInvalidInput:
             Frames([VertexDistance(movie.tissue)])(movie.frames, truth)
 
     def test_invalid_materials_are_rejected(self, without_type_checks):
-        with pytest.raises(TypeError, match="`dissipation` of Material must be an AbstractDiss"):
+        with pytest.raises(TypeError, match="`dissipation` must be an AbstractDiss"):
             Material(ShapeFactorEnergy(3.5), 1.0)  # pyright: ignore[reportArgumentType]
         with pytest.raises(TypeError, match="function of time"):
             Material(lambda time: ShapeFactorEnergy(3.5))(random_tissue(CELLS))

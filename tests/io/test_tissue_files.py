@@ -14,7 +14,7 @@ from helpers import random_tissue, rewritten
 import vertax as vx
 from vertax._base.atomic import atomic_write
 from vertax.io import load_tissue, save_tissue
-from vertax.mesh._topology import flip_edges
+from vertax.transitions._euler_operators import flip_edges
 
 
 def zeros(shape):

@@ -136,9 +136,9 @@ def test_invalid_arguments_raise(without_type_checks):
         mechanics.ramp(start, energy, 0.1)
     with pytest.raises(ValueError, match="must be periodic"):
         BoxRelaxation()(cluster(4, 1), energy)
-    with pytest.raises(ValueError, match="must be one of all, area"):
+    with pytest.raises(ValueError, match="must be one of 'all', 'area'"):
         BoxRelaxation(free="none")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="a number or have shape"):
+    with pytest.raises(ValueError, match="must be one number or have shape"):
         BoxRelaxation(jnp.zeros(3))
     unrolling = vx.Relaxation(solver=vx.solvers.GradientDescent())
     with pytest.raises(ValueError, match="a box takes many"):

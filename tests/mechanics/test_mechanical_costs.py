@@ -40,7 +40,7 @@ def test_stress_costs_are_squared_differences():
     chosen = np.asarray(cells)[[1, 4, 7]]
     np.testing.assert_allclose(values[0], 0.5 * np.sum((stress - CHEAP[0].target) ** 2))
     np.testing.assert_allclose(values[1], 0.5 * np.sum(chosen**2) / 3)
-    with pytest.raises(ValueError, match=r"\(2, 2\) or one entry for each selected cell"):
+    with pytest.raises(ValueError, match="one for each selected cell"):
         costs.CellStress(jnp.zeros((3, 2, 2)))(tissue, e)
 
 

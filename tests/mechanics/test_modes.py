@@ -132,7 +132,7 @@ def test_numbers_of_self_stresses_and_zero_modes_of_rigid_and_fluid_tissues():
 def test_invalid_arguments_raise(without_type_checks):
     with pytest.raises(ValueError, match="must be at most"):
         mechanics.modes(tissue, ENERGY, 49)
-    with pytest.raises(ValueError, match='"dense" or "sparse"'):
+    with pytest.raises(ValueError, match="must be one of None, 'dense', 'sparse'"):
         mechanics.modes(tissue, ENERGY, 2, method="quick")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match='can be "sparse" only'):
         jax.jit(lambda p: mechanics.modes(tissue, ShapeFactorEnergy(p), 2, method="sparse"))(3.6)

@@ -232,7 +232,7 @@ def test_invalid_tissues_are_rejected():
     ):
         with pytest.raises(ValueError, match="`lattice`"):
             vx.Periodic(jnp.array(lattice))
-    with pytest.raises(ValueError, match="`lattice` must hold two"):
+    with pytest.raises(ValueError, match="`lattice` must have shape"):
         vx.Periodic(jnp.ones(2))
 
 

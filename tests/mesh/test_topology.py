@@ -12,7 +12,8 @@ from helpers import random_tissue, tissues
 from hypothesis import given, settings, strategies as st
 
 import vertax as vx
-from vertax.mesh._topology import clockwise, counter_clockwise, flip_edges
+from vertax._base.half_edges import clockwise, counter_clockwise
+from vertax.transitions._euler_operators import flip_edges
 
 flip = jax.jit(flip_edges)
 

@@ -15,8 +15,8 @@ from helpers import ADAM, FIXED_TOPOLOGY, NO_CONTACT, random_tissue, rewritten
 import vertax as vx
 from vertax.io import load_trajectory, save_trajectory
 from vertax.mesh import Trajectory
-from vertax.mesh._topology import flip_edges
 from vertax.relax import record_relaxation
+from vertax.transitions._euler_operators import flip_edges
 
 
 def single(tree):

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import vertax as vx
-from vertax.mesh._topology import flip_edges
 from vertax.plotting import _animation, _style, flipped_edges
 from vertax.plotting._animation import _marks, _placed
 from vertax.plotting._colours import add_bar
 from vertax.plotting._tissue import _repeated
+from vertax.transitions._euler_operators import flip_edges
 
 
 def flipped(tissue, *edges):

@@ -495,11 +495,11 @@ def test_refuses_a_complex_operator():
 
 
 def test_refuses_bad_settings():
-    with pytest.raises(ValueError, match=r"`rtol` must not be negative, but -1.0 was given"):
+    with pytest.raises(ValueError, match=r"`rtol` must be at least 0, but is -1.0"):
         MINRES(rtol=-1.0)
-    with pytest.raises(ValueError, match=r"`atol` must not be negative, but nan was given"):
+    with pytest.raises(ValueError, match=r"`atol` must be at least 0, but is nan"):
         MINRES(atol=float("nan"))
-    with pytest.raises(ValueError, match=r"`max_steps` must be positive, but 0 was given"):
+    with pytest.raises(ValueError, match=r"`max_steps` must be at least 1, but is 0"):
         MINRES(max_steps=0)
 
 

@@ -10,7 +10,7 @@ import optimistix as optx
 import pytest
 
 import vertax as vx
-from vertax.solvers import _rows
+from vertax._base import rows as _rows
 
 N = 30
 PLACES = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (N, 2)))

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+from vertax._base.checks import check_choice
+
 
 @contextlib.contextmanager
 def atomic_write(
@@ -46,8 +48,7 @@ def atomic_write(
     - `FileNotFoundError` if the folder of `path` does not exist.
     - `IsADirectoryError` if `path` is a folder.
     """
-    if mode not in ("w", "wb"):
-        raise ValueError(f'Argument `mode` must be "w" or "wb", but is {mode!r}.')
+    check_choice("mode", mode, ("w", "wb"))
     destination = Path(os.path.realpath(path))
     folder = destination.parent
     if not folder.is_dir():

@@ -18,6 +18,7 @@ import wadler_lindig
 from jaxtyping import PyTree, Shaped
 
 from vertax._base.archive import as_jax, read_archive, write_archive
+from vertax._base.checks import check_number
 
 _VERSION = 1
 # Largest fraction of the run time that is spent on writing.
@@ -62,8 +63,7 @@ class Checkpoint(eqx.Module):
     every: float = eqx.field(default=10.0, converter=float)
 
     def __check_init__(self) -> None:
-        if not self.every >= 0:
-            raise ValueError(f"Argument `every` must not be negative, but is {self.every}.")
+        check_number("every", self.every, at_least=0)
 
 
 class Progress(NamedTuple):

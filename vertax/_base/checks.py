@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -23,6 +23,7 @@ def check_number(
     above: float | int | None = None,
     at_least: float | int | None = None,
     many: bool = False,
+    remedy: str = "",
 ) -> None:
     """Raise an error unless a value is a real number in a range. The range of a tracer is not checked.
 
@@ -32,6 +33,7 @@ def check_number(
     - `value`: a number, or an array of shape `()`.
     - `above`, `at_least`: exclusive and inclusive lower bound.
     - `many`: whether `value` may be an array of any shape; then each entry is checked.
+    - `remedy`: a last sentence of the message.
 
     **Raises:**
 
@@ -58,13 +60,11 @@ def check_number(
         in_range &= array > above
     if at_least is not None:
         in_range &= array >= at_least
-    if not in_range.all():
-        raise ValueError(f"Argument `{name}` must be {condition}, but is {_value_or_range(value)}.")
-    if np.isinf(array).any():
-        finite = "" if condition == "finite" else " and finite"
-        raise ValueError(
-            f"Argument `{name}` must be {condition}{finite}, but is {_value_or_range(value)}."
-        )
+    if in_range.all() and np.isinf(array).any() and condition != "finite":
+        condition += " and finite"
+    if not (in_range & np.isfinite(array)).all():
+        fact = f"Argument `{name}` must be {condition}, but is {_value_or_range(value)}."
+        raise ValueError(f"{fact} {remedy}".rstrip())
 
 
 def check_integer(name: str, value: Any, *, at_least: int | None = None) -> None:
@@ -88,6 +88,45 @@ def check_integer(name: str, value: Any, *, at_least: int | None = None) -> None
         )
     if at_least is not None and value < at_least:
         raise ValueError(f"Argument `{name}` must be {condition}, but is {value}.")
+
+
+def check_instance(name: str, value: Any, kind: Any, expected: str, remedy: str = "") -> None:
+    """Raise a `TypeError` unless a value is an instance of a class.
+
+    **Arguments:**
+
+    - `name`: name of the argument, for the message.
+    - `value`: the value.
+    - `kind`: the class, or a union of classes.
+    - `expected`: the class in words, with an example.
+    - `remedy`: a last sentence of the message.
+    """
+    if not isinstance(value, kind):
+        raise TypeError(
+            f"Argument `{name}` must be {expected}, but is {describe(value)}. {remedy}".rstrip()
+        )
+
+
+def check_function(name: str, value: Any, expected: str, remedy: str = "") -> None:
+    """Raise a `TypeError` unless a value can be called; arguments as for `check_instance`."""
+    check_instance(name, value, Callable, expected, remedy)
+
+
+def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
+    """Raise a `ValueError` unless a value is one of the choices."""
+    if not any(isinstance(value, type(choice)) and value == choice for choice in choices):
+        listed = ", ".join(map(repr, choices))
+        raise ValueError(f"Argument `{name}` must be one of {listed}, but is {value!r}.")
+
+
+def check_shape(name: str, value: Any, *shapes: tuple[int, ...], remedy: str = "") -> None:
+    """Raise a `ValueError` unless an array has one of the shapes; `remedy` ends the message."""
+    shape = np.shape(value)
+    if shape not in shapes:
+        allowed = ["be one number"] if () in shapes else []
+        allowed += [f"have shape {each}" for each in shapes if each]
+        fact = f"Argument `{name}` must {' or '.join(allowed)}, but its shape is {shape}."
+        raise ValueError(f"{fact} {remedy}".rstrip())
 
 
 def check_concrete(function: str, *arguments: Any) -> None:
@@ -169,6 +208,37 @@ def as_real(name: str, value: ArrayLike | Sequence[Any]) -> Array:
     _check_real(name, value)
     array = jnp.asarray(value)
     return array if _floating(array.dtype) else array.astype(jnp.result_type(float))
+
+
+def as_scalar(name: str, value: ArrayLike) -> Float[Array, ""]:
+    """Convert one real number to a JAX array; a `ValueError` for any other shape."""
+    number = as_real(name, value)
+    check_shape(name, number, (), remedy="Take more of them through jax.vmap.")
+    return number
+
+
+def as_list(name: str, value: ArrayLike | Sequence[Any]) -> Float[Array, " numbers"]:
+    """Convert a list of at least one real number to a JAX array; a `ValueError` for any other shape."""
+    numbers = as_real(name, value)
+    if numbers.ndim != 1 or numbers.size == 0:
+        raise ValueError(
+            f"Argument `{name}` must be a list of numbers, but its shape is {numbers.shape}."
+        )
+    return numbers
+
+
+def as_matrix(name: str, value: ArrayLike, *, symmetric: bool = False) -> Float[Array, "2 2"]:
+    """A 2-by-2 matrix; a `ValueError` for any other shape, or if `symmetric` and it is not."""
+    matrix = as_real(name, value)
+    check_shape(name, matrix, (2, 2))
+    if symmetric and is_concrete(matrix):
+        difference, size = abs(float(matrix[0, 1] - matrix[1, 0])), float(jnp.max(jnp.abs(matrix)))
+        if difference > 1e-5 * size:
+            raise ValueError(
+                f"Argument `{name}` must be symmetric, but its off-diagonal entries are "
+                f"{matrix[0, 1]} and {matrix[1, 0]}."
+            )
+    return matrix
 
 
 def as_float64(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray, "..."]:

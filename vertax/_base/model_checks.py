@@ -72,6 +72,26 @@ def instance_hint(value: Any) -> str:
     return f" Pass an instance, {value.__name__}({', '.join(required)})."
 
 
+def check_single(
+    tissue: Any, remedy: str = "Map over a batch with equinox.filter_vmap.", name: str = "tissue"
+) -> None:
+    """Raise a `ValueError` for a batch of tissues as the argument `name`; `remedy` ends the message."""
+    if jnp.ndim(tissue.vertices) != 2:
+        raise ValueError(
+            f"Argument `{name}` must be a single tissue, but its vertices have shape "
+            f"{jnp.shape(tissue.vertices)}. {remedy}"
+        )
+
+
+def check_spare(tissue: Any) -> None:
+    """Raise a `ValueError` for a tissue that was not made with a capacity."""
+    if not tissue.topology.spare:
+        raise ValueError(
+            "Argument `tissue` must support spare slots, for cells that come and go, but does not. Pass "
+            "tissue.with_capacity(tissue.n_cells), or more for cells that divide."
+        )
+
+
 def check_planar(what: str, tissue: Any) -> None:
     """Raise a `ValueError` for a tissue on a surface; `what` names the calculation."""
     surface = getattr(tissue, "surface", None)

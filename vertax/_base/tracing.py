@@ -37,6 +37,15 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
+def frozen(tree: Tree) -> Tree:
+    """The same values as constants: derivatives through them are 0."""
+    # (Concrete arrays are constants already.)
+    if all(map(is_concrete, jax.tree.leaves(tree))):
+        return tree
+    constant = lambda x: x if is_concrete(x) else jax.lax.stop_gradient(x)
+    return jax.tree.map(constant, tree)
+
+
 def closed_over_tracers(function: Any) -> Iterator[str]:
     """Names of the traced variables that a function, or the methods and fields of a module, close over."""
     if isinstance(function, eqx.Module):

@@ -11,7 +11,6 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from vertax._base.results import RESULTS, AbstractOutcome, checked, result_of
-from vertax._base.tracing import is_concrete
 
 
 def _floating(x: ArrayLike) -> Array:
@@ -95,15 +94,6 @@ class AbstractAdjoint(optx.AbstractAdjoint):
 MAX_RELATIVE_RESIDUAL = 0.01
 """The largest relative residual of a reliable gradient: of the linear system, or of the force on a nudged
 tissue."""
-
-
-def frozen(tree: PyTree) -> PyTree:
-    """The same values as constants: derivatives through them are 0."""
-    # (Concrete arrays are constants already.)
-    if all(map(is_concrete, jax.tree.leaves(tree))):
-        return tree
-    constant = lambda x: x if is_concrete(x) else jax.lax.stop_gradient(x)
-    return jax.tree.map(constant, tree)
 
 
 def finish_gradient(

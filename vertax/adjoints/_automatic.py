@@ -11,14 +11,15 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax._base.checks import check_integer, check_number
 from vertax._base.optimistix import Minimisation
 from vertax._base.results import RESULTS, index_of
+from vertax._base.tracing import frozen
 from vertax.adjoints._adjoint import (
     AbstractAdjoint,
     GradientOutcome,
     differentiable,
     finish_gradient,
-    frozen,
     materialise,
 )
 
@@ -61,12 +62,9 @@ class AutomaticDifferentiation(AbstractAdjoint):
     outcome: GradientOutcome | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        if self.checkpoints < 1:
-            raise ValueError(
-                f"Argument `checkpoints` must be at least 1, but is {self.checkpoints}."
-            )
-        if self.rtol is not None and not self.rtol > 0:
-            raise ValueError(f"Argument `rtol` must be positive, but is {self.rtol}.")
+        check_integer("checkpoints", self.checkpoints, at_least=1)
+        if self.rtol is not None:
+            check_number("rtol", self.rtol, above=0)
 
     def apply(
         self,

@@ -14,15 +14,16 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from vertax._base.checks import check_choice
 from vertax._base.optimistix import Minimisation
 from vertax._base.results import RESULTS, index_of
 from vertax._base.scales import Scales
+from vertax._base.tracing import frozen
 from vertax.adjoints._adjoint import (
     MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
     GradientOutcome,
     finish_gradient,
-    frozen,
     materialise,
 )
 from vertax.precondition._preconditioned_minres import PreconditionedMINRES
@@ -69,10 +70,7 @@ class ImplicitDifferentiation(AbstractAdjoint):
     outcome: GradientOutcome | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        if self.mode not in ("adjoint", "sensitivity"):
-            raise ValueError(
-                f"Argument `mode` must be 'adjoint' or 'sensitivity', but is {self.mode!r}."
-            )
+        check_choice("mode", self.mode, ("adjoint", "sensitivity"))
 
     def apply(
         self,

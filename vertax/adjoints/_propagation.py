@@ -14,16 +14,17 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.checks import check_choice, check_number
 from vertax._base.optimistix import Minimisation, num_steps_of
 from vertax._base.results import RESULTS, index_of
 from vertax._base.scales import Scales
+from vertax._base.tracing import frozen
 from vertax.adjoints._adjoint import (
     MAX_RELATIVE_RESIDUAL,
     AbstractAdjoint,
     GradientOutcome,
     differentiable,
     finish_gradient,
-    frozen,
     materialise,
 )
 
@@ -81,11 +82,10 @@ class EquilibriumPropagation(AbstractAdjoint):
     outcome: GradientOutcome | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        if self.nudge not in ("linear", "cost"):
-            raise ValueError(f"Argument `nudge` must be 'linear' or 'cost', but is {self.nudge!r}.")
+        check_choice("nudge", self.nudge, ("linear", "cost"))
         for name, value in (("beta", self.beta), ("rtol", self.rtol)):
-            if isinstance(value, float | int) and not value > 0:
-                raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+            if value is not None:
+                check_number(name, value, above=0)
 
     def apply(
         self,

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vertax._base.checks import as_real, check_number
+from vertax._base.arcs import arc_points, length_factor
+from vertax._base.checks import as_real, check_choice, check_number
 from vertax._base.model_checks import check_planar
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Free, Periodic, Tissue
-from vertax.mesh._arcs import arc_points, length_factor
 
 Measure = Literal["moments", "farthest", "box"]
 
@@ -91,8 +91,8 @@ class AspectRatio(AbstractLeastSquaresCost):
 
     def __check_init__(self):
         _check_measure(self.measure)
-        limit = {"above": 0} if self.measure == "box" else {"at_least": 1}
-        check_number("target", self.target, **limit, many=True)
+        above, at_least = (0, None) if self.measure == "box" else (None, 1)
+        check_number("target", self.target, above=above, at_least=at_least, many=True)
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         r"""$\sqrt2\,(r - r_\mathrm{target})$, because the cost is half the sum of squares."""
@@ -101,10 +101,7 @@ class AspectRatio(AbstractLeastSquaresCost):
 
 
 def _check_measure(measure: str) -> None:
-    if measure not in get_args(Measure):
-        raise ValueError(
-            f"Argument `measure` must be one of {get_args(Measure)}, but is {measure!r}."
-        )
+    check_choice("measure", measure, get_args(Measure))
 
 
 def _from_moments(tissue: Tissue) -> Float[Array, ""]:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vertax._base.checks import as_real, check_number
+from vertax._base.checks import as_real, check_number, check_shape
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -55,11 +55,8 @@ class CellAreas(AbstractLeastSquaresCost):
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         r"""$(A_c - A^t_c) / \sqrt N$."""
-        if self.target.shape not in ((), (tissue.n_cells,)):
-            raise ValueError(
-                "The target of CellAreas must be a scalar or have one entry per cell, shape "
-                f"({tissue.n_cells},), but its shape is {self.target.shape}."
-            )
+        remedy = "Give one area, or one for each cell."
+        check_shape("target", self.target, (), (tissue.n_cells,), remedy=remedy)
         differences = tissue.areas - self.target
         if tissue.topology.spare:
             differences = jnp.where(tissue.alive, differences, 0)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from vertax._base.checks import as_float64, as_real, check_integer, check_number
+from vertax._base.checks import as_float64, as_real, check_integer, check_number, check_shape
+from vertax._base.model_checks import check_single
 from vertax._base.plane import inverse_of
 from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
@@ -67,11 +68,7 @@ def render(
     check_integer("points_per_edge", points_per_edge, at_least=1)
     if pixel_size is not None:
         check_number("pixel_size", pixel_size, above=0)
-    if tissue.vertices.ndim != 2:
-        raise ValueError(
-            f"Argument `tissue` must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}. Map over a batch with equinox.filter_vmap."
-        )
+    check_single(tissue)
     lattice, (rows, columns) = _canvas(tissue.boundary, shape, pixel_size)
     dtype = tissue.vertices.dtype
     nodes, weights = np.polynomial.legendre.leggauss(points_per_edge)
@@ -195,11 +192,7 @@ class MeshImage(AbstractLeastSquaresCost):
                 f"{pixels.shape}."
             )
         weights = xp.ones_like(pixels) if weight is None else convert("weight", weight)
-        if weights.shape != pixels.shape:
-            raise ValueError(
-                f"Argument `weight` must have the shape of the image, {pixels.shape}, but has "
-                f"{weights.shape}."
-            )
+        check_shape("weight", weights, pixels.shape)
         if concrete and (not (weights >= 0).all() or not weights.sum() > 0):
             raise ValueError(
                 "Argument `weight` must be at least 0 everywhere and positive somewhere."

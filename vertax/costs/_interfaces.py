@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from vertax._base.checks import as_real
+from vertax._base.checks import as_real, check_shape
 from vertax._base.indexing import take
 from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractCost
@@ -56,11 +56,8 @@ class HomotypicLength(AbstractCost):
 
     def __call__(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, ""]:
         """Length of homotypic interfaces, or its fraction."""
-        if self.cell_types.shape != (tissue.n_cells,):
-            raise ValueError(
-                f"The types of HomotypicLength must have one entry per cell, shape ({tissue.n_cells},), "
-                f"but their shape is {self.cell_types.shape}."
-            )
+        remedy = "Give one type for each cell."
+        check_shape("cell_types", self.cell_types, (tissue.n_cells,), remedy=remedy)
         cells = tissue.topology.edge_cells
         inner = ~tissue.topology.on_outline
         types = take(self.cell_types, jnp.minimum(cells, tissue.n_cells - 1))

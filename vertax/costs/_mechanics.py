@@ -11,11 +11,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax import mechanics
-from vertax._base.checks import as_real, check_integer, check_number, describe
+from vertax._base.checks import (
+    as_matrix,
+    as_real,
+    check_integer,
+    check_number,
+    check_shape,
+    describe,
+)
 from vertax._base.tracing import is_concrete
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import as_matrix
 from vertax.mechanics._elasticity import shear_part, young_part
 from vertax.mesh import Tissue
 
@@ -87,11 +93,8 @@ class CellStress(AbstractLeastSquaresCost):
                 )
             # An index out of range gives NaN; by default JAX would clip it to the last cell.
             selected = stresses.at[self.cells].get(mode="fill", fill_value=jnp.nan)
-        if self.target.shape not in ((2, 2), selected.shape):
-            raise ValueError(
-                "The target of CellStress must have the shape (2, 2) or one entry for each selected cell, "
-                f"{selected.shape}, but its shape is {self.target.shape}."
-            )
+        remedy = "Give one stress, or one for each selected cell."
+        check_shape("target", self.target, (2, 2), selected.shape, remedy=remedy)
         differences = selected - self.target
         if not tissue.topology.spare:
             return _components(differences) / jnp.sqrt(1.0 * len(differences))

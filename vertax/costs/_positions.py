@@ -8,8 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.checks import check_integer, describe
+from vertax._base.checks import check_choice, check_integer, describe
 from vertax._base.indexing import take
+from vertax._base.model_checks import check_single
 from vertax.costs._cost import AbstractLeastSquaresCost
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -44,11 +45,7 @@ class VertexDistance(AbstractLeastSquaresCost):
 
     def __check_init__(self):
         check_target("VertexDistance", self.target)
-        if self.match not in get_args(Matching):
-            raise ValueError(
-                f"Argument `match` of VertexDistance must be one of {get_args(Matching)}, but is "
-                f"{self.match!r}."
-            )
+        check_choice("match", self.match, get_args(Matching))
 
     def residuals(self, tissue: Tissue, energy: AbstractEnergy) -> Float[Array, " residuals"]:
         r"""$(x_i - x_{\mathrm{target},i}) / \sqrt N$."""
@@ -219,12 +216,8 @@ def check_equal(
     - `ValueError` for different numbers or boundaries, or a batch.
     """
     check_target(caller, target)
-    for each in (tissue, target):
-        if each.vertices.ndim != 2:
-            raise ValueError(
-                f"{caller} must compare a single tissue with a single target, but vertices have shape "
-                f"{each.vertices.shape}. Map over a batch with equinox.filter_vmap, costs included."
-            )
+    for argument, each in {"tissue": tissue, "target": target}.items():
+        check_single(each, "Map over a batch with equinox.filter_vmap, costs included.", argument)
     ours, theirs = (type(t.boundary).__name__ for t in (tissue, target))
     if same_boundary and ours != theirs:
         raise ValueError(

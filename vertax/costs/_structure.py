@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
+from vertax._base.arcs import length_factor
 from vertax._base.checks import check_number
 from vertax._base.minimum_maximum import maximum
 from vertax.costs._cost import AbstractCost
@@ -15,7 +16,6 @@ from vertax.costs._positions import check_equal, check_target
 from vertax.costs._transport import entropic_transport
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._arcs import length_factor
 
 
 class IndexAwareStructural(AbstractCost):

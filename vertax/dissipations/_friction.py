@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._base.checks import as_real, check_number
+from vertax._base.checks import as_real, check_choice, check_number, check_shape
 from vertax.dissipations._dissipation import AbstractViscosity
 from vertax.mesh import Tissue
-from vertax.mesh._curved import surface_points
 
 
 class SubstrateFriction(AbstractViscosity):
@@ -40,8 +39,7 @@ class SubstrateFriction(AbstractViscosity):
 
     def __init__(self, coefficient: ArrayLike, per: Literal["vertex", "area"] = "vertex"):
         self.coefficient = as_coefficient("coefficient", coefficient)
-        if per not in ("vertex", "area"):
-            raise ValueError(f'Argument `per` must be "vertex" or "area", but is {per!r}.')
+        check_choice("per", per, ("vertex", "area"))
         self.per = per
 
     def strains(self, tissue: Tissue, before: Tissue) -> Float[Array, " strains"]:
@@ -50,8 +48,8 @@ class SubstrateFriction(AbstractViscosity):
             reference = before.boundary.carry(before.vertices, tissue.boundary)
             moved = tissue.vertices - reference
         else:
-            moved = surface_points(tissue.surface, tissue.vertices)
-            moved -= surface_points(tissue.surface, before.vertices)
+            now, then = (tissue.surface.points(t.vertices) for t in (tissue, before))
+            moved = (now - then).astype(tissue.vertices.dtype)
         coefficient = broadcast_coefficient(
             self.coefficient, tissue.n_vertices, "coefficient", "vertex"
         )
@@ -80,11 +78,7 @@ def broadcast_coefficient(
 
     - `ValueError` unless there is one coefficient, or one per item.
     """
-    if values.shape not in ((), (size,)):
-        raise ValueError(
-            f"Argument `{name}` must be a scalar or have one entry for each {item}, shape ({size},), but "
-            f"its shape is {values.shape}."
-        )
+    check_shape(name, values, (), (size,), remedy=f"Give one number, or one for each {item}.")
     return jnp.broadcast_to(values, (size,))
 
 

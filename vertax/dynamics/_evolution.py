@@ -15,7 +15,14 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
-from vertax._base.checks import as_key, as_times, check_integer, describe
+from vertax._base.checks import (
+    as_key,
+    as_times,
+    check_choice,
+    check_function,
+    check_instance,
+    check_integer,
+)
 from vertax._base.frame_loop import simulate
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.tracing import is_concrete, traced
@@ -94,16 +101,10 @@ class Evolution(AbstractResponse):
         pins: Callable[[Float[Array, ""]], Float[Array, "vertices 2"]] | None = None,
         relaxation: Relaxation = Relaxation(),
     ):
-        if not isinstance(dissipation, AbstractDissipation):
-            raise TypeError(
-                "Argument `dissipation` must be one of vertax.dissipations, e.g. SubstrateFriction(1.0), "
-                f"but is {describe(dissipation)}."
-            )
-        if not isinstance(activity, AbstractActivity | None):
-            raise TypeError(
-                "Argument `activity` must be one of vertax.activities, e.g. ThermalNoise(0.01), but is "
-                f"{describe(activity)}."
-            )
+        expected = "one of vertax.dissipations, e.g. SubstrateFriction(1.0)"
+        check_instance("dissipation", dissipation, AbstractDissipation, expected)
+        expected = "one of vertax.activities, e.g. ThermalNoise(0.01)"
+        check_instance("activity", activity, AbstractActivity | None, expected)
         if activity is not None and activity.deterministic and key is None:
             key = 0
         if activity is not None and key is None and drive is None:
@@ -114,25 +115,15 @@ class Evolution(AbstractResponse):
         self.activity, self.drive = activity, drive
         self.key = None if key is None else as_key(key)
         self.relaxation = relaxation
-        if not isinstance(self.relaxation, Relaxation):
-            raise TypeError(
-                f"Argument `relaxation` must be a vertax.Relaxation, but is {describe(relaxation)}."
-            )
+        check_instance("relaxation", self.relaxation, Relaxation, "a vertax.Relaxation")
         for name, function in (("boundary", boundary), ("pins", pins)):
-            if function is not None and not callable(function):
-                raise TypeError(
-                    f"Argument `{name}` must be a function of time, but is {describe(function)}. Omit it "
-                    "if it is constant."
-                )
+            if function is not None:
+                check_function(name, function, "a function of time", "Omit it if it is constant.")
         check_integer("substeps", substeps, at_least=1)
-        if order not in (1, 2):
-            raise ValueError(f"Argument `order` must be 1 or 2, but is {order!r}.")
+        check_choice("order", order, (1, 2))
         check_order(order, dissipation)
-        if not isinstance(stepsize_controller, PIController | None):
-            raise TypeError(
-                "Argument `stepsize_controller` must be a vertax.dynamics.PIController, e.g. "
-                f"PIController(1e-3), but is {describe(stepsize_controller)}."
-            )
+        expected = "a vertax.dynamics.PIController, e.g. PIController(1e-3)"
+        check_instance("stepsize_controller", stepsize_controller, PIController | None, expected)
         random = activity is not None and not activity.deterministic
         if stepsize_controller is not None and (substeps != 1 or random):
             conflict = "`activity`" if random else "`substeps`"

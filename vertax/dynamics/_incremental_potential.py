@@ -6,12 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vertax._base.half_edges import source
 from vertax._base.indexing import take
 from vertax._base.model_checks import real_scalar
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._topology import edge_neighbourhood, source
+from vertax.mesh._topology import edge_neighbourhood
 from vertax.relax._inversion_barrier import REACH, inversion_energy_of_all
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from vertax._base.checks import describe
+from vertax._base.checks import check_instance
 from vertax._base.model_checks import check_energy
 from vertax.activities import AbstractActivity
 from vertax.dissipations import AbstractDissipation
@@ -49,11 +49,7 @@ class Material(AbstractEnergy):
             ("activity", AbstractActivity),
         ):
             value: Any = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise TypeError(
-                    f"Argument `{name}` of Material must be an {kind.__name__} or None, but is "
-                    f"{describe(value)}."
-                )
+            check_instance(name, value, kind | None, f"an {kind.__name__} or None")
 
     def __call__(self, tissue: Tissue) -> Float[Array, ""]:
         """The energy of a tissue; a `TypeError` if the energy is a function of time."""

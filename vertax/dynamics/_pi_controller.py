@@ -9,7 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
 from vertax._base.checks import check_integer, check_number
-from vertax.adjoints._adjoint import frozen
+from vertax._base.tracing import frozen
 from vertax.mesh import Tissue
 
 # The PI controller (Söderlind 2002, doi:10.1023/A:1021160023092): with the errors ε_n in units of the

@@ -12,9 +12,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from vertax._base.checks import describe
 from vertax._base.frame_loop import AbstractSimulation, Frame
 from vertax._base.results import RESULTS, first_failure, result_of
-from vertax._base.tracing import tree_where
+from vertax._base.tracing import frozen, tree_where
 from vertax.adjoints import AbstractAdjoint
-from vertax.adjoints._adjoint import frozen
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
 from vertax.dynamics._evolved import Evolved
 from vertax.dynamics._incremental_potential import IncrementalPotential, with_flips_of

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from vertax._base.checks import describe
+from vertax._base.checks import check_shape, describe
 from vertax.energies._energy import AbstractLocalEnergy
 from vertax.mesh import Tissue
 
@@ -71,6 +71,5 @@ def _masked(
     """The terms, with 0 where the mask is True."""
     if mask is None:
         return terms
-    if mask.shape != (size,):
-        raise ValueError(f"Argument `{name}` must have shape ({size},), but has {mask.shape}.")
+    check_shape(name, mask, (size,))
     return jnp.where(mask, 0, terms)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from vertax._base.checks import as_real, describe
+from vertax._base.checks import as_real, check_shape, describe
 from vertax._base.tracing import is_concrete
 from vertax.energies._energy import AbstractLocalEnergy
 from vertax.mesh import Tissue
@@ -54,11 +54,7 @@ class TypeTension(AbstractLocalEnergy):
             and the energy no tension for it.
         """
         n_cells = tissue.n_cells
-        if self.types.shape != (n_cells,):
-            raise ValueError(
-                f"Parameter `types` must have one entry per cell, shape ({n_cells},), but its shape is "
-                f"{self.types.shape}."
-            )
+        check_shape("types", self.types, (n_cells,), remedy="Give one for each cell.")
         if tissue.topology.exterior and self.outline is None:
             raise ValueError(
                 "Parameter `outline` must be a tension for a tissue with an outline, but is None. Pass it to "
@@ -136,9 +132,6 @@ def by_type(
         )
     if outline is not None:
         outline = as_real("outline", outline).astype(table.dtype)
-        if outline.shape not in ((), (len(table),)):
-            raise ValueError(
-                f"Argument `outline` must be a scalar or have one entry for each type, shape "
-                f"({len(table)},), but its shape is {outline.shape}."
-            )
+        remedy = "Give one tension, or one for each type."
+        check_shape("outline", outline, (), (len(table),), remedy=remedy)
     return TypeTension(table[jnp.triu_indices(len(table))], outline, kinds)

@@ -9,9 +9,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._base.checks import as_real
+from vertax._base.checks import as_real, check_shape
 from vertax._base.field_checks import check_fields
-from vertax._base.model_checks import check_energy
+from vertax._base.model_checks import check_energy, check_single
 from vertax.mesh import Tissue
 
 
@@ -151,14 +151,6 @@ def per_edge(values: Parameter, tissue: Tissue, name: str) -> Parameter:
 
 
 def _check(values: Parameter, tissue: Tissue, size: int, name: str, item: str) -> Parameter:
-    if tissue.vertices.ndim != 2:
-        raise ValueError(
-            "Argument `tissue` of an energy must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}. Map over a batch with equinox.filter_vmap."
-        )
-    if jnp.shape(values) not in ((), (size,)):
-        raise ValueError(
-            f"Parameter `{name}` must be a scalar or have one entry per {item}, shape ({size},), but its "
-            f"shape is {jnp.shape(values)}."
-        )
+    check_single(tissue)
+    check_shape(name, values, (), (size,), remedy=f"Give one number, or one for each {item}.")
     return values

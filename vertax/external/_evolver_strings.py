@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vertax._base.arcs import LARGEST_FREE_ANGLE
 from vertax.external._simulator import Edges, SimulatorError
 from vertax.mesh import Periodic, Tissue, angle_of_area
-from vertax.mesh._arcs import LARGEST_FREE_ANGLE
 
 
 # An arc is a chain of n straight strings of equal length between points on a circle. Such a chain is at rest

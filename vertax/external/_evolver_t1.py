@@ -83,7 +83,7 @@ def can_flip(topology: Topology) -> Bool[np.ndarray, " edges"]:
 
 
 def flip_edge(topology: Topology, edge: int) -> Topology:
-    """A topology with one edge flipped, as `vertax.mesh._topology.flip_edges`, in NumPy.
+    """A topology with one edge flipped, as `vertax.transitions._euler_operators.flip_edges`, in NumPy.
 
     (A simulator runs inside a callback, where JAX must not be called.)
     """

@@ -13,13 +13,12 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.checks import check_choice, check_instance, check_integer, check_number
 from vertax._base.model_checks import check_energy, check_planar
 from vertax._base.results import RESULTS
 from vertax._base.scales import Scales
-from vertax._base.tracing import is_concrete, traced
+from vertax._base.tracing import frozen, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
-from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._scales import scales_of
 from vertax.external._external_gradient import ExternalEquilibrium, attach_gradient, force_of
@@ -84,16 +83,9 @@ class External(AbstractResponse):
     timeout: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if not isinstance(self.simulator, AbstractSimulator):
-            raise TypeError(
-                "Argument `simulator` must be an instance of a subclass of "
-                f"vertax.external.AbstractSimulator, but is {describe(self.simulator)}."
-            )
-        if self.slope not in ("energy", "program", "differences"):
-            raise ValueError(
-                "Argument `slope` must be 'energy', 'program' or 'differences', but is "
-                f"{self.slope!r}."
-            )
+        expected = "a vertax.external.AbstractSimulator"
+        check_instance("simulator", self.simulator, AbstractSimulator, expected)
+        check_choice("slope", self.slope, ("energy", "program", "differences"))
         if self.slope != "energy" and self.stiffness is None:
             raise ValueError(
                 "Argument `stiffness` is missing: it is the unit of the nudge, and is computed from the "

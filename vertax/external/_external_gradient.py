@@ -11,8 +11,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from vertax._base.scales import Scales
+from vertax._base.tracing import frozen
 from vertax.adjoints import EquilibriumPropagation, GradientOutcome
-from vertax.adjoints._adjoint import differentiable, finish_gradient, frozen, materialise
+from vertax.adjoints._adjoint import differentiable, finish_gradient, materialise
 from vertax.adjoints._propagation import Phase, RestoringForce, gradient_from_phases
 from vertax.energies import AbstractEnergy
 from vertax.external._host import Request

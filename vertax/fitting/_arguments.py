@@ -7,7 +7,7 @@ from typing import Any
 import optax
 import optimistix as optx
 
-from vertax._base.checks import check_integer, describe
+from vertax._base.checks import check_function, check_instance, check_integer, describe
 from vertax.fitting._inverse import InverseProblem
 
 
@@ -21,22 +21,15 @@ def check_arguments(
     - `TypeError` for an argument of a wrong type.
     - `ValueError` for less than one epoch.
     """
-    if not isinstance(problem, InverseProblem):
-        raise TypeError(
-            f"Argument `problem` must be a vertax.InverseProblem, but is {describe(problem)}."
-        )
+    check_instance("problem", problem, InverseProblem, "a vertax.InverseProblem")
     _check_optimiser(optimiser)
     check_integer("epochs", epochs, at_least=1)
-    if guidance is not None and not callable(guidance):
-        raise TypeError(
-            "Argument `guidance` must be a function of the epoch, such as "
-            f"optax.linear_schedule(1.0, 0.0, 100), but is {describe(guidance)}. A constant strength is set "
-            "in the problem: InverseProblem(..., guidance=...)."
-        )
-    if callback is not None and not callable(callback):
-        raise TypeError(
-            f"Argument `callback` must be a function of epoch and record, but is {describe(callback)}."
-        )
+    if guidance is not None:
+        expected = "a function of the epoch, such as optax.linear_schedule(1.0, 0.0, 100)"
+        remedy = "A constant strength is set in the problem: InverseProblem(..., guidance=...)."
+        check_function("guidance", guidance, expected, remedy)
+    if callback is not None:
+        check_function("callback", callback, "a function of epoch and record")
 
 
 def _check_optimiser(optimiser: Any) -> None:

@@ -16,14 +16,14 @@ from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.model_checks import check_energy, instance_hint, real_scalar, warn_of_columns
-from vertax._base.tracing import traced
+from vertax._base.tracing import frozen, traced
 from vertax.adjoints import (
     AbstractAdjoint,
     EquilibriumPropagation,
     GradientOutcome,
     ImplicitDifferentiation,
 )
-from vertax.adjoints._adjoint import finish_gradient, frozen
+from vertax.adjoints._adjoint import finish_gradient
 from vertax.adjoints._propagation import AbstractNudgedSystem, nudged_cost
 from vertax.costs import AbstractCost
 from vertax.dynamics import Evolved

@@ -11,8 +11,9 @@ from jaxtyping import ArrayLike, PRNGKeyArray
 
 from vertax._base.announce import announce_compilations
 from vertax._base.checkpoints import Checkpoint
-from vertax._base.checks import as_key, as_times, check_integer, describe
+from vertax._base.checks import as_key, as_times, check_instance, check_integer, describe
 from vertax._base.frame_loop import simulate
+from vertax._base.model_checks import check_spare
 from vertax._base.tracing import is_concrete, traced
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
@@ -109,8 +110,7 @@ def grow(
         ("activity", activity, AbstractActivity | None, "an AbstractActivity or None"),
         ("relaxation", relaxation, Relaxation, "a Relaxation"),
     ):
-        if not isinstance(value, kind):
-            raise TypeError(f"Argument `{name}` must be {expected}, but is {describe(value)}.")
+        check_instance(name, value, kind, expected)
     invalid = isinstance(energy, AbstractEnergy) or not callable(energy)
     if invalid or (isinstance(energy, type) and issubclass(energy, AbstractEnergy)):
         name = energy.__name__ if isinstance(energy, type) else "energy"
@@ -124,11 +124,7 @@ def grow(
             "Argument `dissipation` is missing: an activity with random numbers needs one. Pass e.g. "
             "vertax.dissipations.SubstrateFriction(1.0)."
         )
-    if not tissue.topology.spare:
-        raise ValueError(
-            "Argument `tissue` must have spare slots for new cells, but has none. Pass "
-            "tissue.with_capacity(...)."
-        )
+    check_spare(tissue)
     check_integer("substeps", substeps, at_least=1)
     divisions = 4 + tissue.n_cells // 20 if divisions is None else divisions
     check_integer("divisions", divisions, at_least=1)

@@ -23,7 +23,6 @@ from vertax.growth._grown import Grown
 from vertax.growth._life_cycle import AbstractLifeCycle
 from vertax.growth._lineage import Lineage, initial_lineage, record_deaths, record_division
 from vertax.mesh import Tissue
-from vertax.mesh._tissue import mean_area
 from vertax.relax import Relaxation
 from vertax.transitions import T2
 from vertax.transitions._division import divided
@@ -226,7 +225,7 @@ class Growth(AbstractSimulation):
             return after
         # The last two cells cannot vanish: the tissue stays as it was when one of them has collapsed.
         few = jnp.sum(after.tissue.alive) <= 2
-        small = after.tissue.areas < T2().threshold * mean_area(after.tissue)
+        small = after.tissue.areas < T2().threshold * after.tissue.mean_area
         collapsed = few & jnp.any(after.tissue.alive & small)
         result = first_failure(previous.result, RESULTS.too_few_cells)
         ended = eqx.tree_at(lambda s: s.result, previous, result)

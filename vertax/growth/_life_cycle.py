@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from vertax._base.checks import as_real, check_number
+from vertax._base.checks import as_real, check_choice, check_number
 from vertax._base.field_checks import check_fields
 from vertax.mesh import Tissue
 
@@ -126,10 +126,7 @@ class GrowAndDivide(AbstractLifeCycle):
         check_number("variation", variation, at_least=0)
         check_number("death_rate", death_rate, at_least=0)
         check_number("shrinking_time", shrinking_time, above=0)
-        if orientation not in ("long", "random"):
-            raise ValueError(
-                f'Argument `orientation` must be "long" or "random", but is {orientation!r}.'
-            )
+        check_choice("orientation", orientation, ("long", "random"))
         self.growth_rate = as_real("growth_rate", growth_rate)
         self.division_area = as_real("division_area", division_area)
         self.variation = as_real("variation", variation)

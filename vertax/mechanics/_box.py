@@ -11,13 +11,20 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import as_real, check_integer, check_number
+from vertax._base.checks import (
+    as_matrix,
+    as_real,
+    check_choice,
+    check_instance,
+    check_integer,
+    check_number,
+    check_shape,
+)
 from vertax._base.results import RESULTS
-from vertax._base.tracing import traced
+from vertax._base.tracing import frozen, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
-from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import as_matrix, check_relaxation, check_system
+from vertax.mechanics._arguments import check_system
 from vertax.mechanics._elasticity import elastic_tensor
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
@@ -39,10 +46,7 @@ _MAX_STRAIN_STEP = 0.05
 
 def _as_stress(value: ArrayLike) -> Float[Array, "2 2"]:
     stress = as_real("stress", value)
-    if stress.shape not in ((), (2, 2)):
-        raise ValueError(
-            f"Argument `stress` must be a number or have shape (2, 2), but its shape is {stress.shape}."
-        )
+    check_shape("stress", stress, (), (2, 2))
     if stress.shape == ():
         return stress * jnp.eye(2, dtype=stress.dtype)
     return as_matrix("stress", stress, symmetric=True)
@@ -87,11 +91,8 @@ class BoxRelaxation(AbstractResponse):
     max_steps: int = eqx.field(static=True, default=50)
 
     def __check_init__(self):
-        if not isinstance(self.free, str) or self.free not in _FREE_STRAINS:
-            raise ValueError(
-                f"Argument `free` must be one of {', '.join(_FREE_STRAINS)}, but is {self.free!r}."
-            )
-        check_relaxation(self.relaxation)
+        check_choice("free", self.free, tuple(_FREE_STRAINS))
+        check_instance("relaxation", self.relaxation, Relaxation, "a vertax.Relaxation")
         if self.tolerance is not None:
             check_number("tolerance", self.tolerance, above=0)
         check_integer("max_steps", self.max_steps, at_least=1)

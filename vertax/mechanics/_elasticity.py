@@ -12,9 +12,10 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from vertax._base.announce import announced_jit
+from vertax._base.checks import as_scalar
 from vertax._base.tracing import traced
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import as_angle, check_linear_solver, check_system
+from vertax.mechanics._arguments import check_linear_solver, check_system
 from vertax.mechanics._landscape import (
     Landscape,
     area_of,
@@ -164,7 +165,7 @@ def youngs_modulus(
 
 def young_part(tensor: Float[Array, "3 3"], angle: ArrayLike) -> Float[Array, ""]:
     """Young's modulus along a direction, from an elastic tensor."""
-    angle = as_angle(angle)
+    angle = as_scalar("angle", angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     stress = jnp.stack([c**2, s**2, c * s]).astype(tensor.dtype)
     return 1 / (stress @ jnp.linalg.solve(tensor, stress))
@@ -174,7 +175,7 @@ def shear_part(tensor: Float[Array, "3 3"], angle: ArrayLike | None = None) -> F
     """The shear modulus from an elastic tensor, along a direction or the mean over all directions."""
     if angle is None:
         return (tensor[0, 0] + tensor[1, 1] - 2 * tensor[0, 1]) / 8 + tensor[2, 2] / 2
-    angle = as_angle(angle)
+    angle = as_scalar("angle", angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     # ε = (t n + n t) / 2 with t along the direction and n to its left.
     strain = jnp.stack([-c * s, c * s, c**2 - s**2]).astype(tensor.dtype)

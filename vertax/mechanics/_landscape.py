@@ -12,10 +12,11 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from vertax._base.checks import as_matrix
 from vertax._base.model_checks import check_planar, real_scalar
 from vertax._base.tracing import is_concrete
 from vertax.dissipations import AbstractDissipation
-from vertax.mechanics._arguments import as_matrix, check_tissue
+from vertax.mechanics._arguments import check_tissue
 from vertax.mesh import Periodic, Tissue
 
 Motion: TypeAlias = tuple[Float[Array, "2 2"], PyTree[Float[Array, "..."]]]

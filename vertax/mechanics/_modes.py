@@ -14,7 +14,13 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import as_float64, check_concrete, check_integer, check_number
+from vertax._base.checks import (
+    as_float64,
+    check_choice,
+    check_concrete,
+    check_integer,
+    check_number,
+)
 from vertax._base.model_checks import check_planar
 from vertax._base.sparse_normal import factorised
 from vertax._base.tracing import is_concrete, traced
@@ -95,8 +101,7 @@ def modes(
     check_system(tissue, energy)
     check_planar("modes", tissue)
     check_integer("k", k, at_least=1)
-    if method not in (None, "dense", "sparse"):
-        raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
+    check_choice("method", method, (None, "dense", "sparse"))
     size = ravel_pytree(tissue.configuration)[0].size
     is_eager = all(map(is_concrete, jax.tree.leaves((tissue, energy))))
     n_free = int(ravel_pytree(movable(tissue))[0].sum()) if is_eager else size

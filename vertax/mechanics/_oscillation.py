@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 from scipy.sparse import diags_array
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import as_real, check_number
+from vertax._base.checks import as_list, check_choice, check_number
 from vertax._base.sparse_normal import factorised
 from vertax._base.tracing import is_concrete, traced
 from vertax.dissipations import AbstractDissipation
@@ -91,13 +91,10 @@ def complex_modulus(
     check_system(tissue, energy, box="a complex modulus")
     check_dissipation(dissipation)
     check_number("frequencies", frequencies, at_least=0, many=True)
-    omegas = jnp.atleast_1d(as_real("frequencies", frequencies)).astype(tissue.vertices.dtype)
-    if omegas.ndim != 1 or omegas.size == 0:
-        raise ValueError(
-            f"Argument `frequencies` must be a list of numbers, but its shape is {omegas.shape}."
-        )
-    if method not in (None, "dense", "sparse"):
-        raise ValueError(f'Argument `method` must be "dense" or "sparse", but is {method!r}.')
+    omegas = as_list("frequencies", jnp.atleast_1d(jnp.asarray(frequencies))).astype(
+        tissue.vertices.dtype
+    )
+    check_choice("method", method, (None, "dense", "sparse"))
     args = (*traced((tissue, energy, dissipation), tissue.vertices.dtype), omegas)
     real, imaginary = _tensors_of(args, method)
     part = jax.vmap(lambda tensor: shear_part(tensor, angle))

@@ -15,13 +15,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from vertax._base.announce import announce_compilations
 from vertax._base.batch import member
 from vertax._base.checkpoints import Checkpoint
-from vertax._base.checks import as_real, describe
+from vertax._base.checks import as_list, as_matrix, as_scalar, check_function, check_instance
 from vertax._base.frame_loop import AbstractSimulation, Frame, simulate
 from vertax._base.results import RESULTS, AbstractOutcome, first_failure, first_of, result_of
 from vertax._base.tracing import traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
-from vertax.mechanics._arguments import as_matrix, check_relaxation, check_system
+from vertax.mechanics._arguments import check_system
 from vertax.mechanics._landscape import deformed
 from vertax.mechanics._stress import stress
 from vertax.mesh import Tissue, Trajectory
@@ -32,25 +32,15 @@ Deformation = Callable[[Float[Array, ""]], Float[Array, "2 2"]]
 
 def simple_shear(strain: ArrayLike) -> Float[Array, "2 2"]:
     r"""Simple shear along x by $\gamma$: the deformation gradient `[[1, γ], [0, 1]]`."""
-    strain = _as_strain(strain)
+    strain = as_scalar("strain", strain)
     zero, one = jnp.zeros_like(strain), jnp.ones_like(strain)
     return jnp.stack([jnp.stack([one, strain]), jnp.stack([zero, one])])
 
 
 def pure_shear(strain: ArrayLike) -> Float[Array, "2 2"]:
     r"""Pure shear at fixed area: the deformation gradient `diag(exp(ε), exp(-ε))`."""
-    strain = _as_strain(strain)
+    strain = as_scalar("strain", strain)
     return jnp.diag(jnp.stack([jnp.exp(strain), jnp.exp(-strain)]))
-
-
-def _as_strain(strain: ArrayLike) -> Float[Array, ""]:
-    value = as_real("strain", strain)
-    if value.shape != ():
-        raise ValueError(
-            f"Argument `strain` must be one number, but its shape is {value.shape}. Take more of them "
-            "through jax.vmap."
-        )
-    return value
 
 
 class Ramp(AbstractOutcome):
@@ -145,18 +135,13 @@ def ramp(
     - `RuntimeError` (of Equinox inside `jax.jit`) if `throw` and a relaxation did not converge.
     """
     check_system(tissue, energy, box="a ramp")
-    values = as_real("strains", strains).astype(tissue.vertices.dtype)
-    if values.ndim != 1 or values.size == 0:
-        raise ValueError(
-            f"Argument `strains` must be a list of numbers, but its shape is {values.shape}."
-        )
-    if not callable(deformation):
-        raise TypeError(
-            "Argument `deformation` must be a function from a strain to a deformation gradient, e.g. "
-            f"vertax.mechanics.pure_shear, but is {describe(deformation)}."
-        )
+    values = as_list("strains", strains).astype(tissue.vertices.dtype)
+    expected = (
+        "a function from a strain to a deformation gradient, e.g. vertax.mechanics.pure_shear"
+    )
+    check_function("deformation", deformation, expected)
     as_matrix("deformation", jnp.zeros(jax.eval_shape(deformation, values[0]).shape))
-    check_relaxation(relaxation)
+    check_instance("relaxation", relaxation, Relaxation, "a vertax.Relaxation")
     tissue, energy = traced((tissue, energy), tissue.vertices.dtype)
     relaxation.check(tissue, energy, adjoint)
     simulation = _Deformation(tissue, energy, deformation, relaxation.traced(), adjoint)

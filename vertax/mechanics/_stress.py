@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vertax._base.announce import announced_jit
+from vertax._base.arcs import area_factor, length_factor
 from vertax._base.checks import as_real
 from vertax._base.model_checks import check_planar, real_scalar
 from vertax._base.tracing import traced
@@ -15,8 +16,6 @@ from vertax.mechanics._arguments import check_system
 from vertax.mechanics._forces import pressures_and_tensions
 from vertax.mechanics._landscape import area_of, deformed
 from vertax.mesh import Tissue
-from vertax.mesh._arcs import area_factor, length_factor
-from vertax.mesh._curved import space_chords
 
 
 def stress(tissue: Tissue, energy: AbstractEnergy) -> Float[Array, "2 2"]:
@@ -109,9 +108,7 @@ def _directed_lengths(tissue: Tissue) -> Float[Array, "edges space space"]:
     """The integral of t ⊗ t along each edge; its trace is the length of the edge. On a surface in space."""
     # For an arc with half-angle α and chord c, with R = c / (2 sin α), the principal values are
     # R (α + sin α cos α) along the chord and R (α - sin α cos α) = 2 c g sin α across it.
-    chord, angle = tissue.edge_vectors, tissue.edge_angles
-    if tissue.surface is not None:
-        chord = space_chords(tissue.surface, tissue._segments())
+    chord, angle = tissue.edge_chords, tissue.edge_angles
     squared = jnp.sum(chord**2, axis=-1) + tissue.softening**2
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1))
     outer = lambda v: v[:, :, None] * v[:, None, :] / length[:, None, None]

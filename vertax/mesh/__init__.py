@@ -1,6 +1,7 @@
 """The mesh: connectivity, positions, boundary and geometry of a tissue."""
 
-from vertax.mesh._arcs import Arcs as Arcs, angle_of_area as angle_of_area
+from vertax._base.arcs import angle_of_area as angle_of_area
+from vertax.mesh._arcs import Arcs as Arcs
 from vertax.mesh._boundary import (
     AbstractBoundary as AbstractBoundary,
     Free as Free,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
-from vertax._base.checks import describe
+from vertax._base.checks import check_shape, describe
 from vertax._base.plane import inverse_of
 from vertax._base.tracing import is_concrete
 
@@ -85,11 +85,8 @@ class Periodic(AbstractBoundary):
 
     def __init__(self, lattice: ArrayLike):
         lattice = jnp.asarray(lattice)
-        if lattice.shape != (2, 2):
-            raise ValueError(
-                "Argument `lattice` must hold two lattice vectors as rows, shape (2, 2), but its shape "
-                f"is {lattice.shape}. For a rectangle pass jnp.diag(jnp.array([width, height]))."
-            )
+        remedy = "For a rectangle pass jnp.diag(jnp.array([width, height]))."
+        check_shape("lattice", lattice, (2, 2), remedy=remedy)
         if is_concrete(lattice):
             rows = np.asarray(lattice, float)
             if not np.isfinite(rows).all() or np.linalg.det(rows) <= 0:

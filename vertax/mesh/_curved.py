@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vertax._base.checks import describe
+from vertax._base.checks import check_instance
+from vertax._base.half_edges import clockwise
 from vertax._base.indexing import take
 from vertax._base.tracing import is_concrete
 from vertax.mesh._boundary import AbstractBoundary, Periodic
-from vertax.mesh._topology import Topology, clockwise
+from vertax.mesh._topology import Topology
 from vertax.surfaces import AbstractSurface
 
 # An edge is the chord in space between its ends. A cell is the part of the surface above its polygon in the
@@ -28,18 +29,11 @@ from vertax.surfaces import AbstractSurface
 Segments = tuple[Float[Array, " edges"], ...]
 
 
-def surface_points(
-    surface: AbstractSurface, x: Float[Array, "*shape 2"]
-) -> Float[Array, "*shape 3"]:
-    """Points in space, in the precision of the chart."""
-    return surface.points(x).astype(x.dtype)
-
-
 def space_chords(surface: AbstractSurface, segments: Segments) -> Float[Array, "edges 3"]:
     """The chord of each edge in space."""
     x, y, dx, dy = segments
     ends = jnp.stack([jnp.stack([x, x + dx]), jnp.stack([y, y + dy])], axis=-1)
-    first, second = surface_points(surface, ends)
+    first, second = surface.points(ends).astype(ends.dtype)
     return second - first
 
 
@@ -89,11 +83,8 @@ def check_surface(
     - `ValueError` for a tissue with arcs, vertices outside of the chart, points that are not finite, or a
         surface with another period than the box.
     """
-    if not isinstance(surface, AbstractSurface):
-        raise TypeError(
-            "Argument `surface` must be a surface, e.g. vertax.surfaces.Cylinder(3.0), or None, but is "
-            f"{describe(surface)}."
-        )
+    expected = "a surface, e.g. vertax.surfaces.Cylinder(3.0), or None"
+    check_instance("surface", surface, AbstractSurface, expected)
     if arcs:
         raise ValueError(
             "Argument `surface` must be None in a tissue with arcs: edges on a surface are straight chords. "

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vertax._base.custom_transpose import linear_with_transpose
+from vertax._base.half_edges import source
 from vertax._base.indexing import take
 from vertax._base.sums import total
-from vertax.mesh._topology import Topology, source
+from vertax.mesh._topology import Topology
 
 
 class EdgeEnds(NamedTuple):

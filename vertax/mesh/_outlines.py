@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.checks import check_number
 from vertax._base.indexing import take
 from vertax.mesh._boundary import Periodic
 from vertax.mesh._padding import pad
@@ -145,10 +146,7 @@ def cell_polygons(
 
     - `ValueError` if `points_per_arc` is not positive.
     """
-    if points_per_arc < 1:
-        raise ValueError(
-            f"Argument `points_per_arc` must be a positive whole number, but is {points_per_arc}."
-        )
+    check_number("points_per_arc", points_per_arc, at_least=1)
     return Drawing(tissue, points_per_arc).polygons()
 
 

@@ -11,18 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from vertax._base.arcs import arc_points, area_factor, bounded, length_factor, moment_factor
+from vertax._base.checks import check_number, check_shape
+from vertax._base.half_edges import clockwise, source
 from vertax._base.indexing import take
 from vertax._base.model_checks import check_planar
 from vertax._base.plane import cross
 from vertax._base.sums import total
 from vertax._base.tracing import compiled_property, is_concrete
-from vertax.mesh._arcs import Arcs, arc_points, area_factor, bounded, length_factor, moment_factor
+from vertax.mesh._arcs import Arcs
 from vertax.mesh._boundary import AbstractBoundary, Free, Periodic
 from vertax.mesh._capacity import size_class, with_slots, without_slots
 from vertax.mesh._curved import area_shares, check_surface, space_chords
 from vertax.mesh._edge_ends import gather_at_ends
 from vertax.mesh._overlaps import Overlaps, find_overlaps
-from vertax.mesh._topology import Topology, clockwise, edge_neighbourhood, source
+from vertax.mesh._topology import Topology, edge_neighbourhood
 from vertax.surfaces import AbstractSurface
 
 
@@ -102,11 +105,7 @@ class Tissue(eqx.Module):
         surface: AbstractSurface | None = None,
     ):
         vertices = jnp.asarray(vertices, jnp.result_type(vertices, jnp.float32))
-        if vertices.shape != (topology.n_vertices, 2):
-            raise ValueError(
-                f"Argument `vertices` must have shape ({topology.n_vertices}, 2) to match the topology, "
-                f"but has {vertices.shape}."
-            )
+        check_shape("vertices", vertices, (topology.n_vertices, 2))
         if is_concrete(vertices) and not np.isfinite(np.asarray(vertices)).all():
             raise ValueError("Argument `vertices` must be finite, but holds NaN or infinity.")
         if isinstance(boundary, Free) != topology.exterior:
@@ -127,11 +126,9 @@ class Tissue(eqx.Module):
             angles = _checked_angles(angles, vertices.dtype, topology)
             self.arcs = Arcs(angles, jnp.ones((), vertices.dtype), inner=inner_arcs)
         self.pinned = None if pinned is None else jnp.asarray(pinned, bool)
-        if self.pinned is not None and self.pinned.shape != (topology.n_vertices,):
-            raise ValueError(
-                f"Argument `pinned` must have shape ({topology.n_vertices},), but has "
-                f"{self.pinned.shape}."
-            )
+        if self.pinned is not None:
+            remedy = "Give one boolean for each vertex."
+            check_shape("pinned", self.pinned, (topology.n_vertices,), remedy=remedy)
         if surface is not None:
             check_surface(surface, vertices, boundary, arcs=angles is not None)
         self.surface = surface
@@ -140,17 +137,15 @@ class Tissue(eqx.Module):
             # Padded, so that tissues of similar size share the compiled function.
             concrete = all(map(is_concrete, jax.tree.leaves(self)))
             padded = self.with_capacity(size_class(self.n_cells)) if concrete else self
-            size = jnp.sqrt(jax.lax.stop_gradient(_mean_area(padded)))
+            size = jnp.sqrt(jax.lax.stop_gradient(padded.mean_area))
             softening = 1e-3 * size if softening is None else softening
             angle_length = 0.5 * size if angle_length is None else angle_length
         softening = jnp.asarray(softening, vertices.dtype)
-        if is_concrete(softening) and not softening >= 0:
-            raise ValueError(f"Argument `softening` must be at least 0, but is {softening}.")
+        check_number("softening", softening, at_least=0)
         self.softening = softening
         if self.arcs is not None:
             length = jnp.asarray(angle_length, vertices.dtype)
-            if is_concrete(length) and not length > 0:
-                raise ValueError(f"Argument `angle_length` must be positive, but is {length}.")
+            check_number("angle_length", length, above=0)
             self.arcs = Arcs(self.arcs.angles, length, inner=inner_arcs)
 
     @property
@@ -203,6 +198,13 @@ class Tissue(eqx.Module):
     def edge_vectors(self) -> Float[Array, "edges 2"]:
         """Vector from the first to the second vertex of each edge, across periodic boundaries."""
         return self.edge_segments[1]
+
+    @compiled_property
+    def edge_chords(self) -> Float[Array, "edges axes"]:
+        """Vector from the first to the second vertex of each edge, in space on a surface (three axes)."""
+        if self.surface is None:
+            return self.edge_vectors
+        return space_chords(self.surface, self._segments())
 
     def edge_points(self, fractions: Float[Array, " points"]) -> Float[Array, "edges points 2"]:
         """Points on each edge at given fractions (0 to 1) of its length.
@@ -266,6 +268,14 @@ class Tissue(eqx.Module):
         return self.measured().areas
 
     @compiled_property
+    def mean_area(self) -> Float[Array, ""]:
+        """Mean area of the living cells."""
+        n_alive = jnp.sum(self.alive) if self.topology.spare else self.n_cells
+        if isinstance(self.boundary, Periodic) and self.surface is None:
+            return jnp.abs(self.boundary.area) / n_alive
+        return jnp.sum(jnp.abs(self.areas)) / n_alive
+
+    @compiled_property
     def cell_size(self) -> Float[Array, ""]:
         """Square root of the mean area of the living cells, the unit of lengths.
 
@@ -274,7 +284,7 @@ class Tissue(eqx.Module):
         tissue = self
         if self.angles is not None:
             tissue = self.with_angles(jnp.clip(self.angles, -_LARGEST_ANGLE, _LARGEST_ANGLE))
-        return jnp.sqrt(mean_area(tissue))
+        return jnp.sqrt(tissue.mean_area)
 
     @compiled_property
     def perimeters(self) -> Float[Array, " cells"]:
@@ -595,29 +605,12 @@ def _checked_angles(
     angles: ArrayLike, dtype: jnp.dtype, topology: Topology
 ) -> Float[Array, " edges"]:
     angles = jnp.asarray(angles, dtype)
-    if angles.shape != (topology.n_edges,):
-        raise ValueError(
-            f"Argument `angles` must have shape ({topology.n_edges},), but has {angles.shape}."
-        )
+    check_shape("angles", angles, (topology.n_edges,))
     if is_concrete(angles) and not np.isfinite(np.asarray(angles)).all():
         raise ValueError("Argument `angles` must be finite, but holds NaN or infinity.")
     return angles
 
 
-@eqx.filter_jit
-def _mean_area(tissue: Tissue) -> Float[Array, ""]:
-    return mean_area(tissue)
-
-
 # Half of the angle that an arc spans, in radians. At this angle the area of the circular segment is 5.3
 # times that of the half disc over the same chord.
 _LARGEST_ANGLE = 2.5
-
-
-def mean_area(tissue: Tissue) -> Float[Array, ""]:
-    """The mean area of the living cells."""
-    if isinstance(tissue.boundary, Periodic) and tissue.surface is None:
-        n_alive = jnp.sum(tissue.alive) if tissue.topology.spare else tissue.n_cells
-        return jnp.abs(tissue.boundary.area) / n_alive
-    areas = jnp.abs(tissue.areas)
-    return jnp.sum(areas) / jnp.sum(tissue.alive) if tissue.topology.spare else jnp.mean(areas)

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from vertax._base.half_edges import clockwise, counter_clockwise, source
 from vertax._base.indexing import take
 from vertax._base.tracing import compiled_property, is_concrete
 from vertax.mesh._topology_checks import check_half_edge_arrays
@@ -329,64 +330,6 @@ class Topology(eqx.Module):
             )
 
 
-def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
-    """Flip the marked edges (the topological part of a T1 transition).
-
-    A flipped half-edge turns clockwise by 90°: the cells at the ends of the edge become the cells on its
-    sides. Two marked edges must not share a cell (except the exterior). Vertices do not move.
-    """
-    # At h = v -> w, with t its twin, the four other half-edges counter-clockwise are a, b (at v) and
-    # c, d (at w). In the picture h points east; V, L, W, R are the cells around it.
-    #
-    #       a     L     d                     b    L    a
-    #        \         /          roll           \     /
-    #     V   v --h-- w   W      ======>       V    v    W
-    #        /         \                            |h
-    #       b     R     c                           w
-    #                                             /   \
-    #                                            c  R  d
-    #
-    # The data of a (twin, cell, edge) move to b, b to c, c to d and d to a. `roll` is that permutation of
-    # half-edges and `unroll` its inverse. The relabelled mesh is twin' = roll ∘ twin ∘ unroll, which is an
-    # involution even if two of the four are twins.
-    #
-    # Each half-edge computes whether it flips, or which of its two neighbours around the vertex does: the
-    # half-edge after a flipped one is an a or a c, the one before it a b or a d.
-    twin, frame, h = topology.twin, topology.frame, topology.half_edge
-    half_edges = jnp.arange(topology.n_half_edges, dtype=h.dtype)
-    left, right = counter_clockwise(half_edges), clockwise(half_edges)
-    flips = take(flip, topology.edge)
-    follows, leads = take(flips, right), take(flips, left)
-    beside = lambda neighbour, turn: turn(take(twin, neighbour))
-    roll = jnp.where(leads, beside(left, counter_clockwise), half_edges)
-    roll = jnp.where(follows, left, roll)
-    unroll = jnp.where(follows, beside(right, clockwise), half_edges)
-    unroll = jnp.where(leads, right, unroll)
-    ahead = counter_clockwise(twin)
-    cell = take(topology.cell, jnp.where(flips, ahead, unroll))
-    # Corners: v remains a corner of L and V and becomes one of W; w remains one of R and W and becomes one
-    # of V. The frame of a new corner is that of the other end minus the offset of the flipped edge.
-    step = (take(frame, clockwise(twin)) - frame) * flips[:, None]
-    frame = (
-        take(frame, jnp.where(flips, ahead, jnp.where(follows | leads, right, half_edges))) - step
-    )
-    twin, half_edge = take(roll, take(twin, unroll)), take(roll, h)
-    if topology.exterior:  # it must be on the right of edges
-        outside = take(cell, half_edge) == topology.n_cells
-        half_edge = jnp.where(outside, take(twin, half_edge), half_edge)
-    return eqx.tree_at(
-        lambda m: (m.twin, m.cell, m.frame, m.edge, m.half_edge),
-        topology,
-        (
-            twin,
-            cell,
-            frame,
-            take(topology.edge, unroll),
-            half_edge,
-        ),
-    )
-
-
 def edge_neighbourhood(
     topology: Topology, edges: Int[Array, " edges"] | None = None
 ) -> tuple[Int[Array, " edges"], ...]:
@@ -398,24 +341,3 @@ def edge_neighbourhood(
     h = topology.half_edge if edges is None else take(topology.half_edge, edges)
     t = take(topology.twin, h)
     return t, counter_clockwise(h), clockwise(h), counter_clockwise(t), clockwise(t)
-
-
-# These functions use `jax.lax` to compile fast: `//`, `%` and `[]` of jax.numpy each expand into a dozen
-# operations for negative numbers and bounds.
-
-
-def source(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
-    """The vertex that a half-edge leaves."""
-    return jax.lax.div(h, jnp.asarray(3, h.dtype))
-
-
-def clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
-    """The half-edge one slot clockwise around the same vertex."""
-    slot = jax.lax.rem(h, jnp.asarray(3, h.dtype))
-    return h + jax.lax.select(slot == 0, jnp.full_like(h, 2), jnp.full_like(h, -1))
-
-
-def counter_clockwise(h: Int[Array, "*shape"]) -> Int[Array, "*shape"]:
-    """The half-edge one slot counter-clockwise around the same vertex."""
-    slot = jax.lax.rem(h, jnp.asarray(3, h.dtype))
-    return h + jax.lax.select(slot == 2, jnp.full_like(h, -2), jnp.full_like(h, 1))

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Shaped
 
+from vertax._base.checks import check_integer
+from vertax._base.model_checks import check_single
 from vertax.mesh import Tissue
 
 
@@ -53,8 +55,7 @@ class Trajectory(Sequence[Tissue]):
     every: int
 
     def __init__(self, *, every: int = 1):
-        if every < 1:
-            raise ValueError(f"Argument `every` must be at least 1, but is {every}.")
+        check_integer("every", every, at_least=1)
         self.every = every
         self._frames: list[Tissue] = []
         self._values: dict[str, list[int | float | np.ndarray]] = {}
@@ -98,11 +99,7 @@ class Trajectory(Sequence[Tissue]):
         - `ValueError` for a tissue of another size, kind or precision, for other names or shapes, or for a
             value that does not hold numbers.
         """
-        if tissue.vertices.ndim != 2:
-            raise ValueError(
-                "Argument `tissue` must be a single tissue, but its vertices have shape "
-                f"{tissue.vertices.shape}. Record the members of a batch one by one."
-            )
+        check_single(tissue, "Record the members of a batch one by one.")
         frame: Tissue = jax.tree.map(np.asarray, tissue)
         numbers = {name: _number(name, value) for name, value in values.items()}
         if self._frames:

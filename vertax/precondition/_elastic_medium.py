@@ -13,9 +13,9 @@ from jaxtyping import Array, Complex, Float, Int, PyTree
 
 from vertax._base.indexing import take
 from vertax._base.plane import inverse_of
+from vertax._base.rows import Rows
 from vertax._base.sums import total
 from vertax.mesh import Periodic, Tissue
-from vertax.solvers._rows import Rows
 
 # (With one point for four cells a gradient takes a quarter more products with the Hessian.)
 _CELLS_PER_POINT = 1

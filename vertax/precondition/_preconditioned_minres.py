@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax._base.rows import point_of, table_of
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import zeros_of
 from vertax.precondition._sum import Preconditioner, TissueInverse
 from vertax.solvers import MINRES
-from vertax.solvers._rows import point_of, table_of
 
 
 class _Attempt(NamedTuple):

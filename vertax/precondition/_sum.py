@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from vertax._base.rows import Table, point_of, rows_of, table_of, times
 from vertax.precondition._edge_blocks import EdgeBlocks
 from vertax.precondition._elastic_medium import ElasticMedium
 from vertax.solvers._conjugate_gradients import AbstractInverse
-from vertax.solvers._rows import Table, point_of, rows_of, table_of, times
 
 
 class Preconditioner(eqx.Module):

@@ -21,10 +21,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from vertax._base.half_edges import source
 from vertax._base.indexing import take
 from vertax._base.sums import total
 from vertax.mesh import Tissue, Topology
-from vertax.mesh._topology import source
 
 FLOOR = 1e-4
 """What stands beside the argument of the logarithm: the barrier is finite."""

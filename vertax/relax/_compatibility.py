@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
+from vertax._base.checks import check_instance
 from vertax._base.tracing import differs_between_devices
 from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.solvers import AbstractSolver, Wrapped
@@ -13,11 +14,8 @@ from vertax.solvers import AbstractSolver, Wrapped
 
 def check_adjoint(adjoint: Any, solver: AbstractSolver) -> None:
     """Raise an error for an adjoint that does not support the solver."""
-    if not isinstance(adjoint, AbstractAdjoint):
-        raise TypeError(
-            "Argument `adjoint` must be one of vertax.adjoints, e.g. ImplicitDifferentiation(), but is "
-            f"{type(adjoint).__name__}."
-        )
+    expected = "one of vertax.adjoints, e.g. ImplicitDifferentiation()"
+    check_instance("adjoint", adjoint, AbstractAdjoint, expected)
     if adjoint.unrolls and not solver.unrollable:
         inner = solver.solver if isinstance(solver, Wrapped) else solver
         raise ValueError(

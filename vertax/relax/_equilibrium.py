@@ -10,9 +10,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.results import RESULTS
 from vertax._base.scales import Scales
-from vertax._base.tracing import is_concrete
+from vertax._base.tracing import frozen, is_concrete
 from vertax.adjoints import AbstractAdjoint
-from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
 from vertax.relax._contacts import Contacts

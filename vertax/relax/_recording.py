@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.checks import check_integer
+from vertax._base.model_checks import check_single
 from vertax._base.tracing import traced
 from vertax.adjoints import ImplicitDifferentiation
 from vertax.energies import AbstractEnergy
@@ -45,13 +47,8 @@ def record_relaxation(
         [`equilibrate`][vertax.equilibrate].
     - `RuntimeError` if `throw` and the relaxation did not converge.
     """
-    if every < 1:
-        raise ValueError(f"Argument `every` must be at least 1, but is {every}.")
-    if tissue.vertices.ndim != 2:
-        raise ValueError(
-            "Argument `tissue` must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}. Record the members of a batch one by one."
-        )
+    check_integer("every", every, at_least=1)
+    check_single(tissue, "Record the members of a batch one by one.")
     response = (Relaxation() if response is None else response).traced()
     response.check(tissue, energy, ImplicitDifferentiation())
     tissue, energy = jax.tree.map(jnp.asarray, tissue), energy

@@ -14,14 +14,13 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import check_integer, check_number
+from vertax._base.checks import check_instance, check_integer, check_number
 from vertax._base.memory_maps import warn_of_memory_maps
 from vertax._base.model_checks import check_energy, warn_of_columns
 from vertax._base.results import RESULTS, any_is
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
-from vertax._base.tracing import closed_over_tracers, is_concrete, traced
+from vertax._base.tracing import closed_over_tracers, frozen, is_concrete, traced
 from vertax.adjoints import AbstractAdjoint, ImplicitDifferentiation
-from vertax.adjoints._adjoint import frozen
 from vertax.energies import AbstractEnergy
 from vertax.energies._scales import scales_of
 from vertax.mesh import Tissue
@@ -87,11 +86,8 @@ class Relaxation(AbstractResponse):
 
     def __check_init__(self):
         check_solver(self.solver)
-        if not isinstance(self.transitions, AbstractTransitions | None):
-            raise TypeError(
-                "Argument `transitions` must be a rule for topology changes, e.g. vertax.T1(), or None, "
-                f"but is {self.transitions!r}."
-            )
+        expected = "a rule for topology changes, e.g. vertax.T1(), or None"
+        check_instance("transitions", self.transitions, AbstractTransitions | None, expected)
         for name in ("tolerance", "consecutive_steps", "max_steps"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0, many=True)

@@ -7,11 +7,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from vertax._base.arcs import length_factor
+from vertax._base.half_edges import clockwise
 from vertax._base.indexing import take
 from vertax.mesh import Tissue
-from vertax.mesh._arcs import length_factor
-from vertax.mesh._curved import space_chords, surface_points
-from vertax.mesh._topology import clockwise
 
 
 class Exchange(NamedTuple):
@@ -35,7 +34,7 @@ class Exchange(NamedTuple):
         frames = take(m.frame, m.half_edge) - take(m.frame, clockwise(m.half_edge))
         right = right + tissue.boundary.translation(frames)
         if tissue.surface is not None:
-            left, right = (surface_points(tissue.surface, x) for x in (left, right))
+            left, right = (tissue.surface.points(x).astype(x.dtype) for x in (left, right))
         distances = _norm(right - left)
         apart = inside & (distances > 0)
         return cls(cells, jnp.where(apart, _lengths(tissue) / jnp.where(apart, distances, 1), 0))
@@ -75,10 +74,7 @@ def redistributed(
 
 def _lengths(tissue: Tissue) -> Float[Array, " edges"]:
     """The lengths of edges without softening: 0 for an edge in a T1 transition, and for spare slots."""
-    vectors = tissue.edge_vectors
-    if tissue.surface is not None:
-        vectors = space_chords(tissue.surface, tissue._segments())
-    lengths = _norm(vectors)
+    lengths = _norm(tissue.edge_chords)
     if tissue.arcs is not None:
         lengths = lengths * length_factor(tissue.edge_angles)
     m = tissue.topology

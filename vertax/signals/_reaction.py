@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vertax._base.checks import as_real, describe
+from vertax._base.checks import as_real, check_instance, describe
 from vertax._base.field_checks import check_fields
 from vertax.mesh import Tissue
 
@@ -111,11 +111,9 @@ def check_rates(reaction: AbstractReaction | None) -> None:
     """Raise an error unless a reaction is an instance with finite rates."""
     if reaction is None:
         return
-    if not isinstance(reaction, AbstractReaction):
-        raise TypeError(
-            "Argument `reaction` must be a vertax.signals.AbstractReaction or None, but is "
-            f"{describe(reaction)}. Write a subclass with the method `__call__`, and pass an instance."
-        )
+    expected = "a vertax.signals.AbstractReaction or None"
+    remedy = "Write a subclass with the method `__call__`, and pass an instance."
+    check_instance("reaction", reaction, AbstractReaction, expected, remedy)
     for path, leaf in jax.tree_util.tree_flatten_with_path(reaction)[0]:
         if isinstance(leaf, float) or eqx.is_inexact_array(leaf):
             as_real(f"reaction{jax.tree_util.keystr(path)}", leaf)

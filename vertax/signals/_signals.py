@@ -11,7 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from vertax._base.checks import as_real, check_integer, check_number, describe
+from vertax._base.checks import (
+    as_real,
+    check_instance,
+    check_integer,
+    check_number,
+    describe,
+)
 from vertax._base.extras import requires_extra
 from vertax._base.tracing import is_concrete
 from vertax.activities import AbstractActivity
@@ -19,7 +25,6 @@ from vertax.dissipations import AbstractDissipation
 from vertax.dynamics import Material
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._tissue import mean_area
 from vertax.signals._exchange import Exchange, redistributed
 from vertax.signals._reaction import (
     AbstractReaction,
@@ -145,11 +150,8 @@ class Signals(AbstractActivity):
                 "Argument `couple` must be a function of concentrations and a tissue that returns an energy, "
                 f"but is {describe(couple)}. Pass lambda concentrations, tissue: ..."
             )
-        if not isinstance(solver, diffrax.AbstractSolver | None):
-            raise TypeError(
-                "Argument `solver` must be a solver of Diffrax, e.g. diffrax.Kvaerno3(), but is "
-                f"{describe(solver)}."
-            )
+        expected = "a solver of Diffrax, e.g. diffrax.Kvaerno3()"
+        check_instance("solver", solver, diffrax.AbstractSolver | None, expected)
         check_number("rtol", rtol, above=0)
         check_number("atol", atol, above=0)
         check_integer("max_steps", max_steps, at_least=1)
@@ -270,7 +272,7 @@ class Signals(AbstractActivity):
         import diffrax
 
         # Amounts in units of the mean area, so that the tolerances are those of concentrations.
-        unit = jax.lax.stop_gradient(mean_area(tissue))
+        unit = jax.lax.stop_gradient(tissue.mean_area)
         relative_areas = _areas(tissue) / unit
         exchange = Exchange.of(tissue)
         cells = None if self.reaction is None else self.reaction.sense(tissue)

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.reductions import max_of
+from vertax._base.rows import Table, inner, row_inner, sizes
 from vertax._base.tracing import zeros_of
-from vertax.solvers._rows import Table, inner, row_inner, sizes
 
 
 class Proposal(NamedTuple):

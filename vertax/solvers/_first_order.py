@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
 
-from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.checks import check_instance, check_integer, check_number
 from vertax._base.scales import Scales
 from vertax._base.tracing import is_concrete
 from vertax.solvers._solver import AbstractSolver, value_and_gradient, with_value_and_gradient
@@ -84,11 +84,8 @@ class Optax(AbstractSolver):
     optimiser: optax.GradientTransformation = eqx.field(static=True)
 
     def __check_init__(self):
-        if not isinstance(self.optimiser, optax.GradientTransformation):
-            raise TypeError(
-                "Argument `optimiser` must be an Optax optimiser, such as optax.adam(1e-2), but is "
-                f"{describe(self.optimiser)}."
-            )
+        expected = "an Optax optimiser, such as optax.adam(1e-2)"
+        check_instance("optimiser", self.optimiser, optax.GradientTransformation, expected)
 
     @property
     def unrollable(self) -> bool:

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vertax._base.checks import check_integer, check_number
 from vertax._base.probe_vector import probe_vector
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import tree_where
@@ -146,12 +147,10 @@ class MINRES(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
 
     def __check_init__(self):
         for name, value in (("rtol", self.rtol), ("atol", self.atol)):
-            if value is not None and not value >= 0:
-                raise ValueError(f"Argument `{name}` must not be negative, but {value} was given.")
-        if self.max_steps is not None and self.max_steps < 1:
-            raise ValueError(
-                f"Argument `max_steps` must be positive, but {self.max_steps} was given."
-            )
+            if value is not None:
+                check_number(name, value, at_least=0)
+        if self.max_steps is not None:
+            check_integer("max_steps", self.max_steps, at_least=1)
 
     def init(
         self, operator: lx.AbstractLinearOperator, options: dict[str, Any]

@@ -11,15 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from vertax._base.scales import Scales
-from vertax._base.tracing import tree_where
-from vertax.solvers._conjugate_gradients import (
-    AbstractInverse,
-    DiagonalInverse,
-    Proposal,
-    TruncatedCG,
-)
-from vertax.solvers._rows import (
+from vertax._base.rows import (
     Table,
     inner,
     max_size,
@@ -28,6 +20,14 @@ from vertax.solvers._rows import (
     sizes,
     table_of,
     typical_size,
+)
+from vertax._base.scales import Scales
+from vertax._base.tracing import tree_where
+from vertax.solvers._conjugate_gradients import (
+    AbstractInverse,
+    DiagonalInverse,
+    Proposal,
+    TruncatedCG,
 )
 from vertax.solvers._solver import AbstractIteration, Progress, value_and_gradient
 from vertax.solvers._trust_region import VertexTrustRegion

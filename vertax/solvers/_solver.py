@@ -13,9 +13,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 from optax import tree
 
+from vertax._base.rows import Rows
 from vertax._base.scales import Scales
 from vertax._base.tracing import tree_where, zeros_of
-from vertax.solvers._rows import Rows
 
 State = TypeVar("State")
 

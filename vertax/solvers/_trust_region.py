@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vertax._base.reductions import max_of
-from vertax.solvers._rows import Table, row_inner, sizes
+from vertax._base.rows import Table, row_inner, sizes
 
 
 class VertexTrustRegion(eqx.Module):

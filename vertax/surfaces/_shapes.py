@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from vertax._base.checks import as_real, check_number
+from vertax._base.checks import as_real, check_function, check_number
 from vertax.surfaces._surface import AbstractSurface, density_of_graph
 
 
@@ -116,8 +116,7 @@ class Graph(AbstractSurface):
     function: eqx.Module | jax.tree_util.Partial
 
     def __init__(self, function: Callable[[Float[Array, "2"]], Float[Array, ""]]):
-        if not callable(function):
-            raise TypeError(f"Argument `function` must be a function, but is {function!r}.")
+        check_function("function", function, "a function")
         # A plain function is no leaf of the pytree, so that `jax.vmap` and `jax.jit` accept the surface.
         pytree = isinstance(function, eqx.Module | jax.tree_util.Partial)
         self.function = function if pytree else jax.tree_util.Partial(function)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import describe
+from vertax._base.checks import check_instance, check_shape
 from vertax._base.indexing import take
+from vertax._base.model_checks import check_spare
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.energies import Ablated, AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._euler_operators import merge_cells
+from vertax.transitions._euler_operators import merge_cells
 from vertax.transitions._t1 import has_new_overlaps
 from vertax.transitions._t2 import face_sides
 
@@ -55,32 +58,24 @@ def ablate(
         would surround living cells or be all of a free tissue, a neighbour would have too few sides, or
         cells would overlap.
     """
-    if not isinstance(energy, AbstractLocalEnergy):
-        raise TypeError(
-            "Argument `energy` must be a sum over cells and edges, an AbstractLocalEnergy, but is "
-            f"{describe(energy)}."
-        )
+    check_instance(
+        "energy", energy, AbstractLocalEnergy, "a sum over cells and edges, an AbstractLocalEnergy"
+    )
     if edges is None and cells is None:
         raise ValueError(
             "Argument `edges` or `cells` must be a mask of booleans, but both are None."
         )
-    ablated = Ablated(energy, cells, edges)
+    ablated = Ablated(cast(AbstractLocalEnergy, energy), cells, edges)
     for name, mask, size in (
         ("edges", ablated.edges, tissue.n_edges),
         ("cells", ablated.cells, tissue.n_cells),
     ):
-        if mask is not None and mask.shape != (size,):
-            raise ValueError(
-                f"Argument `{name}` must be a mask of booleans of shape ({size},), but has {mask.shape}. "
-                f"For one of them by its number: {name}=jnp.arange({size}) == 7."
-            )
+        if mask is not None:
+            remedy = f"For one of them by its number: {name}=jnp.arange({size}) == 7."
+            check_shape(name, mask, (size,), remedy=remedy)
     if ablated.cells is None:
         return tissue, ablated
-    if not tissue.topology.spare:
-        raise ValueError(
-            "Argument `tissue` must support spare slots, to ablate cells, but does not. Pass "
-            "tissue.with_capacity(tissue.n_cells)."
-        )
+    check_spare(tissue)
     merged, separate = _merged(tissue, ablated.cells)
     reason = (
         "Argument `cells` must hold cells that become one hole where they touch, but two of them cannot: "

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from vertax._base.axes import AXES, gather
+from vertax._base.checks import check_choice
 from vertax._base.results import RESULTS, AbstractOutcome
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
@@ -51,8 +52,7 @@ class Change(AbstractOutcome):
             energy with as many entries as there are cells, edges or vertices.
         - `ValueError` for an array of another length than declared, or another `axis`.
         """
-        if axis is not None and axis not in AXES:
-            raise ValueError(f"Argument `axis` must be one of {AXES} or None, but is {axis!r}.")
+        check_choice("axis", axis, (*AXES, None))
         parents = {kind: getattr(self, kind) for kind in AXES}
         sizes = {kind: parent.shape[-1] for kind, parent in parents.items()}
         return gather(tree, parents, sizes, axis=axis, opaque=(Tissue,), strict=(AbstractEnergy,))

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.arcs import arc_points
 from vertax._base.indexing import take
 from vertax._base.plane import cross
 from vertax.mesh import Tissue
-from vertax.mesh._arcs import arc_points
 
 # Least distance of the ends of a new edge from the corners, as a fraction of the side.
 _MARGIN = 0.05

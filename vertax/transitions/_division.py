@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import as_real, check_integer
+from vertax._base.checks import as_real, check_integer, check_shape
 from vertax._base.indexing import take
 from vertax._base.results import RESULTS, checked
 from vertax._base.tracing import is_concrete, tree_where
 from vertax.mesh import Tissue, Topology
-from vertax.mesh._euler_operators import Slot, spare_slot, split_cell
 from vertax.transitions._change import Change, unchanged
 from vertax.transitions._cut import Cut, find_cut, points_at
+from vertax.transitions._euler_operators import Slot, spare_slot, split_cell
 from vertax.transitions._t1 import has_new_overlaps
 
 
@@ -60,8 +60,7 @@ def divide(
     """
     if axis is not None:
         axis = as_real("axis", axis)
-        if axis.shape != (2,):
-            raise ValueError(f"Argument `axis` must have shape (2,), but has {axis.shape}.")
+        check_shape("axis", axis, (2,))
         if is_concrete(axis) and not np.any(np.asarray(axis)):
             raise ValueError("Argument `axis` must be a direction, but is zero.")
     check_cell(tissue, cell)

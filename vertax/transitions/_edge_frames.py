@@ -7,12 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.arcs import length_factor
+from vertax._base.half_edges import source
 from vertax._base.indexing import take
 from vertax._base.plane import cross, dot
 from vertax.mesh import Tissue
-from vertax.mesh._arcs import length_factor
 from vertax.mesh._sides import Sides
-from vertax.mesh._topology import edge_neighbourhood, flip_edges, source
+from vertax.mesh._topology import edge_neighbourhood
+from vertax.transitions._euler_operators import flip_edges
 
 
 class EdgeFrames(eqx.Module):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from vertax._base.announce import announced_jit
+from vertax._base.model_checks import check_spare
 from vertax._base.results import RESULTS, checked
 from vertax._base.tracing import tree_where
 from vertax.mesh import Tissue
@@ -42,11 +43,7 @@ def remove(tissue: Tissue, cell: int | Int[Array, ""], *, throw: bool = True) ->
     - `RuntimeError` (an error of Equinox inside `jax.jit`) if the cell cannot be removed: a neighbour would
         have too few sides, cells would overlap, or a corner is pinned.
     """
-    if not tissue.topology.spare:
-        raise ValueError(
-            "Argument `tissue` must support spare slots, to remove a cell, but does not. Pass "
-            "tissue.with_capacity(tissue.n_cells)."
-        )
+    check_spare(tissue)
     check_cell(tissue, cell)
     change = _remove(tissue, jnp.asarray(cell))
     return checked(change, change.result) if throw else change

@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vertax._base.checks import check_number
 from vertax._base.indexing import take
 from vertax._base.reductions import any_of
 from vertax._base.sums import total
-from vertax._base.tracing import is_concrete
 from vertax.energies import AbstractEnergy, AbstractLocalEnergy
 from vertax.mesh import Overlaps, Tissue
 from vertax.mesh._measured_tissue import MeasuredTissue
-from vertax.mesh._tissue import mean_area
 from vertax.transitions._edge_frames import EdgeFrames
 from vertax.transitions._transitions import AbstractTransitions
 
@@ -63,13 +62,9 @@ class T1(AbstractTransitions):
     max_flips: int | Int[Array, ""] = 20
 
     def __check_init__(self):
-        if is_concrete(self.threshold) and not self.threshold > 0:
-            raise ValueError(
-                f"Argument `threshold` must be positive, but is {self.threshold}. To switch T1 "
-                "transitions off pass `transitions=None`."
-            )
-        if is_concrete(self.max_flips) and not self.max_flips >= 1:
-            raise ValueError(f"Argument `max_flips` must be at least 1, but is {self.max_flips}.")
+        remedy = "To switch T1 transitions off pass `transitions=None`."
+        check_number("threshold", self.threshold, above=0, remedy=remedy)
+        check_number("max_flips", self.max_flips, at_least=1)
 
     def init(self, tissue: Tissue) -> Int[Array, " edges"]:
         """The number of flips of each edge: 0."""
@@ -153,7 +148,7 @@ def has_new_overlaps(new: Tissue, before: Tissue) -> Bool[Array, ""]:
     """Whether a change made faces overlap, or areas of cells vanish."""
     crossed = overlapping_faces(new.overlaps) & ~overlapping_faces(before.overlaps)
     # (A cell of two sides has no area if its arc is straight.)
-    least = 1e3 * jnp.finfo(before.vertices.dtype).eps * mean_area(before)
+    least = 1e3 * jnp.finfo(before.vertices.dtype).eps * before.mean_area
     flat = new.alive & (new.areas <= least) & ~(before.alive & (before.areas <= least))
     return jnp.any(crossed) | jnp.any(flat)
 

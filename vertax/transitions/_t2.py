@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vertax._base.checks import check_number
+from vertax._base.half_edges import clockwise, counter_clockwise, source
 from vertax._base.indexing import take
+from vertax._base.model_checks import check_spare
 from vertax._base.tracing import tree_where
 from vertax.energies import AbstractEnergy
 from vertax.mesh import Tissue
-from vertax.mesh._euler_operators import collapse_triangle, merge_cells
-from vertax.mesh._tissue import mean_area
-from vertax.mesh._topology import clockwise, counter_clockwise, source
+from vertax.transitions._euler_operators import collapse_triangle, merge_cells
 from vertax.transitions._t1 import has_new_overlaps
 from vertax.transitions._transitions import AbstractTransitions
 
@@ -47,11 +47,7 @@ class T2(AbstractTransitions):
 
     def init(self, tissue: Tissue) -> Int[Array, " edges"]:
         """Zero counts of transitions for each edge."""
-        if not tissue.topology.spare:
-            raise ValueError(
-                "Argument `tissue` must support spare slots for T2 transitions, but does not. Pass "
-                "tissue.with_capacity(tissue.n_cells)."
-            )
+        check_spare(tissue)
         return jnp.zeros(tissue.n_edges, jnp.int32)
 
     def sweep(
@@ -65,7 +61,7 @@ class T2(AbstractTransitions):
 
         `allowed` has no effect, because a cell stays anyway if cells would overlap.
         """
-        limit = self.threshold * mean_area(tissue)
+        limit = self.threshold * tissue.mean_area
 
         def candidates(tissue: Tissue, remaining: Array) -> Array:
             # (Cells that a large step has turned inside out do not vanish; the relaxation corrects them.)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vertax.mesh import _arcs
-from vertax.mesh._arcs import (
+from vertax._base import arcs as _arcs
+from vertax._base.arcs import (
     LARGEST_FREE_ANGLE,
     angle_of_area,
     arc_points,

@@ -1,7 +1,7 @@
-"""Euler operators of the mesh: split a cell, collapse a triangle, merge two cells.
+"""Operators of the mesh: flip edges, split a cell, collapse a triangle, merge two cells.
 
-Each operator changes one place of the mesh; its half-edge may be traced. If the boolean `do` is False the
-topology is unchanged.
+The last three (Euler operators) change one place of the mesh; its half-edge may be traced. If the boolean
+`do` is False the topology is unchanged.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from vertax._base.half_edges import clockwise, counter_clockwise, source
 from vertax._base.indexing import take
-from vertax.mesh._topology import Topology, clockwise, counter_clockwise, source
+from vertax.mesh import Topology
 
 Index = Int[Array, ""]
 Condition = Bool[Array, ""]
@@ -206,3 +207,61 @@ def merge_cells(m: Topology, h: Index, do: Condition) -> Topology:
             half_edge=_put(m.half_edge, do, (edge, jnp.where(forward, start, end))),
         )
     return _freed(m, (source(h), source(t)), tuple(removed), do)
+
+
+def flip_edges(topology: Topology, flip: Bool[Array, " edges"]) -> Topology:
+    """Flip the marked edges (the topological part of a T1 transition).
+
+    A flipped half-edge turns clockwise by 90°: the cells at the ends of the edge become the cells on its
+    sides. Two marked edges must not share a cell (except the exterior). Vertices do not move.
+    """
+    # At h = v -> w, with t its twin, the four other half-edges counter-clockwise are a, b (at v) and
+    # c, d (at w). In the picture h points east; V, L, W, R are the cells around it.
+    #
+    #       a     L     d                     b    L    a
+    #        \         /          roll           \     /
+    #     V   v --h-- w   W      ======>       V    v    W
+    #        /         \                            |h
+    #       b     R     c                           w
+    #                                             /   \
+    #                                            c  R  d
+    #
+    # The data of a (twin, cell, edge) move to b, b to c, c to d and d to a. `roll` is that permutation of
+    # half-edges and `unroll` its inverse. The relabelled mesh is twin' = roll ∘ twin ∘ unroll, which is an
+    # involution even if two of the four are twins.
+    #
+    # Each half-edge computes whether it flips, or which of its two neighbours around the vertex does: the
+    # half-edge after a flipped one is an a or a c, the one before it a b or a d.
+    twin, frame, h = topology.twin, topology.frame, topology.half_edge
+    half_edges = jnp.arange(topology.n_half_edges, dtype=h.dtype)
+    left, right = counter_clockwise(half_edges), clockwise(half_edges)
+    flips = take(flip, topology.edge)
+    follows, leads = take(flips, right), take(flips, left)
+    beside = lambda neighbour, turn: turn(take(twin, neighbour))
+    roll = jnp.where(leads, beside(left, counter_clockwise), half_edges)
+    roll = jnp.where(follows, left, roll)
+    unroll = jnp.where(follows, beside(right, clockwise), half_edges)
+    unroll = jnp.where(leads, right, unroll)
+    ahead = counter_clockwise(twin)
+    cell = take(topology.cell, jnp.where(flips, ahead, unroll))
+    # Corners: v remains a corner of L and V and becomes one of W; w remains one of R and W and becomes one
+    # of V. The frame of a new corner is that of the other end minus the offset of the flipped edge.
+    step = (take(frame, clockwise(twin)) - frame) * flips[:, None]
+    frame = (
+        take(frame, jnp.where(flips, ahead, jnp.where(follows | leads, right, half_edges))) - step
+    )
+    twin, half_edge = take(roll, take(twin, unroll)), take(roll, h)
+    if topology.exterior:  # it must be on the right of edges
+        outside = take(cell, half_edge) == topology.n_cells
+        half_edge = jnp.where(outside, take(twin, half_edge), half_edge)
+    return eqx.tree_at(
+        lambda m: (m.twin, m.cell, m.frame, m.edge, m.half_edge),
+        topology,
+        (
+            twin,
+            cell,
+            frame,
+            take(topology.edge, unroll),
+            half_edge,
+        ),
+    )
