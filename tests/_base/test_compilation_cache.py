@@ -99,6 +99,7 @@ print(hits.count("/jax/compilation_cache/cache_hits"), hits.count("/jax/compilat
 """
 
 
+@pytest.mark.thorough
 def test_second_process_reads_the_cache(home):
     def counts():
         environment = os.environ | {"VERTAX_CACHE": str(home / "kept")}

@@ -77,7 +77,7 @@ def test_a_dead_scheduler_is_named():
         list(vx.map_tasks(int, range(3), executor=Dead()))
 
 
-@pytest.mark.parametrize("recovers", [True, False])
+@pytest.mark.parametrize("recovers", [pytest.param(True, marks=pytest.mark.thorough), False])
 def test_a_task_with_a_dead_process_is_repeated_once(tmp_path, recovers):
     path = str(tmp_path / "died") if recovers else ""
     with LocalProcesses(2) as pool:

@@ -128,7 +128,7 @@ def test_hypergradient_after_transitions(adjoint, response, rtol):
     assert distance(evaluation.gradient, reference) < rtol
 
 
-@adjoints("implicit", "sensitivity", "propagation", "automatic")
+@adjoints("implicit", thorough=("sensitivity", "propagation", "automatic"))
 def test_gradient_with_respect_to_the_shape_of_the_box(adjoint, response, rtol):
     tissue, energy, cost = start_and_cost()
     direction = 0.1 * random_like(tissue.boundary.lattice)
@@ -469,6 +469,7 @@ class TestDegenerateEquilibrium:
             ),
         ],
     )
+    @pytest.mark.thorough
     def test_outcome_is_degenerate(self, adjoint, result):
         outcome = evaluate(*fluid(), adjoint, FIXED_TOPOLOGY).outcome
         assert outcome.result == result

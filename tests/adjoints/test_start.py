@@ -55,22 +55,14 @@ def pinned(tissue, *vertices):
     return eqx.tree_at(lambda t: t.pinned, tissue, mask, is_leaf=lambda x: x is None)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("adjoint", "response"),
     [
         pytest.param(IMPLICIT, PRECISE, id="implicit"),
-        pytest.param(
-            vx.ImplicitDifferentiation("sensitivity"),
-            PRECISE,
-            id="sensitivity",
-            marks=pytest.mark.thorough,
-        ),
-        pytest.param(
-            vx.EquilibriumPropagation(), PRECISE, id="propagation", marks=pytest.mark.thorough
-        ),
-        pytest.param(
-            vx.AutomaticDifferentiation(), MOMENTUM, id="automatic", marks=pytest.mark.thorough
-        ),
+        pytest.param(vx.ImplicitDifferentiation("sensitivity"), PRECISE, id="sensitivity"),
+        pytest.param(vx.EquilibriumPropagation(), PRECISE, id="propagation"),
+        pytest.param(vx.AutomaticDifferentiation(), MOMENTUM, id="automatic"),
     ],
 )
 def test_centroid_of_a_periodic_tissue_follows_the_start(adjoint, response):
@@ -88,6 +80,7 @@ def test_orientation_of_a_free_tissue_follows_the_start(adjoint):
     assert jnp.abs(slope - jnp.mean(slope, axis=0)).max() > 1e-3
 
 
+@pytest.mark.thorough
 def test_forward_mode_follows_the_start():
     direction = random_like(PERIODIC.vertices)
     relax = lambda x: PRECISE(PERIODIC.with_vertices(x), PERIODIC_ENERGY).tissue.vertices

@@ -149,12 +149,14 @@ class Constant(vx.costs.AbstractLeastSquaresCost):
         return jnp.ones(5)
 
 
+@pytest.mark.thorough
 def test_data_that_determine_nothing_are_rejected(linear):
     density = bayes.LogPosterior(dataclasses.replace(linear, cost=Constant()), PRIOR, 1.0)
     with pytest.raises(ValueError, match="The data determine no parameter"):
         bayes.Laplace(density)
 
 
+@pytest.mark.thorough
 def test_short_edges_cause_a_warning(linear):
     from vertax.bayes._posterior import Posterior
 

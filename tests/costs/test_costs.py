@@ -81,6 +81,7 @@ def test_cost_of_true_image_is_zero_for_any_brightness_and_contrast():
     assert value_of(MeshImage(-image, 0.12), tissue, energy) == pytest.approx(0.5)
 
 
+@pytest.mark.thorough
 def test_image_cost_is_minimal_at_the_true_tissue():
     tissue, _ = relaxed(12, 1)
     cost = MeshImage(render(tissue, (64, 64), 0.1), 0.1)

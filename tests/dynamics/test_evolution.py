@@ -363,6 +363,7 @@ class TestErrors:
         with pytest.raises(TypeError, match="function of time that returns one, but returned"):
             vx.evolve(tissue, lambda time: 3.0 * time, FRICTION, [0.0, 1.0])  # pyright: ignore
 
+    @pytest.mark.thorough
     def test_folded_box_raises(self):
         tissue, energy = solid()
         shrunk = lambda time: vx.Periodic(
@@ -420,6 +421,7 @@ class TestErrors:
         with pytest.raises(TypeError, match="must be of the class Periodic"):
             vx.evolve(tissue, energy, FRICTION, [0.0, 1.0], boundary=not_a_boundary)  # pyright: ignore[reportArgumentType]
 
+    @pytest.mark.thorough
     def test_step_that_does_not_converge_raises(self):
         tissue = random_tissue(N_CELLS, 3)
         with pytest.raises(RuntimeError, match=r"time 0\.5, frame 1"):

@@ -124,6 +124,7 @@ def test_numbers_are_constants_and_arrays_are_parameters():
 )
 def test_parameters_of_wrong_shape_are_rejected(energy):
     with pytest.raises(
-        ValueError, match=r"Argument `.*` must be one number or have shape .* one for each (cell|edge)"
+        ValueError,
+        match=r"Argument `.*` must be one number or have shape .* one for each (cell|edge)",
     ):
         energy(tissue)

@@ -64,6 +64,7 @@ def test_cells_of_a_periodic_box_are_matched_across_its_boundary():
         assert movie.frame(frame).n_vertices == tissue.n_vertices
 
 
+@pytest.mark.thorough
 def test_t1_transition_is_recognised():
     tissue = vx.initialise.periodic_voronoi(36, key=jax.random.key(2))
     end = vx.equilibrate(tissue, vx.energies.ShapeFactorEnergy(3.8)).tissue
@@ -212,7 +213,7 @@ def test_corners_on_sides_of_neighbours_are_inserted():
     np.testing.assert_allclose(movie.frame(1).areas, [2, 1, 1], rtol=1e-12)
 
 
-@pytest.mark.parametrize("n_cells", [12, 100])
+@pytest.mark.parametrize("n_cells", [12, pytest.param(100, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("digits", [6, 4, 3])
 def test_rounded_corners_of_a_periodic_box_are_joined(n_cells, digits):
     tissue = vx.initialise.periodic_voronoi(n_cells, key=jax.random.key(2))

@@ -113,6 +113,7 @@ def test_a_micrograph_with_heights_is_a_tissue_on_a_surface():
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="the folder ../shared/data/curved is not there")
+@pytest.mark.thorough
 def test_areas_of_a_real_epithelium_are_the_published_ones():
     """A polygon has another projected area than its cell in the image; their ratio is taken out."""
     labels = vx.tensions.read_mask(DATA / "outlines.tif")

@@ -11,6 +11,7 @@ THOROUGH = [
 
 
 @pytest.mark.parametrize("options", [{}, *THOROUGH])
+@pytest.mark.thorough
 def test_free_clusters_have_no_overlaps(options):
     # With these seeds, arcs that preserve the cell areas cross before the repair.
     for seed in (6, 7, 19, 28):

@@ -119,6 +119,7 @@ def test_labels_of_other_cells_are_named(folder):
         )
 
 
+@pytest.mark.thorough
 def test_cells_are_followed_when_one_dies(tmp_path):
     """Chaste numbers cells by their places in a list, which shift if a cell is removed."""
     tissue = vx.initialise.free_voronoi(20, key=jax.random.key(4), lloyd_steps=20)

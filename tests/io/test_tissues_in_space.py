@@ -55,6 +55,7 @@ def test_a_map_through_points_reproduces_a_paraboloid():
     np.testing.assert_allclose(surface.points(jnp.asarray(inner))[:, 2], height(inner), atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_the_error_of_a_map_through_points_decreases_with_their_number():
     errors = []
     for n in (100, 400, 1600):
@@ -139,6 +140,7 @@ def test_tables_of_tyssue_in_space(polygons, on_cap):
         vx.io.from_tyssue(tables, inner_arcs=True)
 
 
+@pytest.mark.thorough
 def test_edge_tables_in_space(on_cap):
     table = dict(vx.io.edge_table(on_cap))
     for end in ("start", "end"):

@@ -188,7 +188,7 @@ def _same(one, other):
 
 
 @pytest.mark.parametrize("numbered", [False, True])
-@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize("free", [pytest.param(False, marks=pytest.mark.thorough), True])
 def test_construction_in_jit_and_vmap_agrees(free, numbered):
     make = vx.initialise.free_voronoi if free else vx.initialise.periodic_voronoi
     topologies = [make(9, key=jax.random.key(seed)).topology for seed in (1, 2)]

@@ -87,6 +87,7 @@ class TestRelaxation:
         changed = [not eqx.tree_equal(a.topology, b.topology) for a, b in pairwise(trajectory)]
         np.testing.assert_array_equal(flips > 0, changed)
 
+    @pytest.mark.thorough
     def test_frames_do_not_depend_on_the_interval(self, relaxation):
         tissue, energy, _, trajectory = relaxation
         _, sparse = record_relaxation(tissue, energy, every=4)

@@ -81,6 +81,7 @@ def test_frames_of_a_gif_are_not_shorter_than_viewers_show(way, tmp_path):
     assert frames_of(tmp_path / "fast.gif")[1] == [20, 20, 20, 120]
 
 
+@pytest.mark.thorough
 def test_colour_bar_shows_values_beyond_its_limits(way, tmp_path, monkeypatch):
     bars = []
     keep = lambda *args, **options: bars.append(add_bar(*args, **options))

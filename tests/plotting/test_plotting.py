@@ -90,6 +90,7 @@ class TestPolygons:
             places.add(tuple(np.round(cell_polygons(moved)[0].ravel(), 6) + 0.0))
         assert len(places) == 1
 
+    @pytest.mark.thorough
     def test_number_of_points_per_arc(self):
         tissue = cluster(5)
         off = []

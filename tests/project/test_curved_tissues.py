@@ -124,13 +124,16 @@ def same_displacements(monkeypatch):
 
 # (They compile for 3 to 13 seconds; `equilibrate` and `evolve` stay.)
 LONG = {
+    "costs.matching_vertices",
     "costs.render",
     "growth.grow",
     "mechanics.recoil",
+    "mechanics.velocities",
     "relax.record_relaxation",
     "transitions.T1",
     "transitions.T2",
     "transitions.ablate",
+    "signals.Signals",
 }
 
 

@@ -76,6 +76,7 @@ def crowded_tissues() -> Iterator[vx.Tissue]:
             yield short
 
 
+@pytest.mark.thorough
 def test_transitions_of_the_initial_tissue_make_no_overlaps():
     """The first flips happen before the first step."""
     energy, flips = shapes(np.full(N, 3.7)), 0
@@ -206,6 +207,7 @@ def test_the_error_names_the_cells_of_an_initial_overlap():
         vx.equilibrate(overlapping, shapes(np.full(N, 3.7)), max_steps=1)
 
 
+@pytest.mark.thorough
 def test_contacts_do_not_change_a_tissue_without_contacts():
     energy = shapes(np.full(N, 3.6))
     start = vx.equilibrate(tissue_of(2), energy).tissue

@@ -65,6 +65,7 @@ def free_cluster(centre):
     return vx.Tissue(vertices, cluster.topology, cluster.boundary)
 
 
+@pytest.mark.thorough
 def test_a_foam_comes_to_rest_on_a_steep_surface_with_transitions():
     steep = Graph(lambda x: 0.9 * jnp.cos(2 * jnp.pi * x[0] / 5) * jnp.cos(2 * jnp.pi * x[1] / 5))
     tissue = random_tissue(25, 1).with_surface(steep)
@@ -76,6 +77,7 @@ def test_a_foam_comes_to_rest_on_a_steep_surface_with_transitions():
 
 
 @pytest.mark.parametrize("name", [pytest.param("bump", marks=pytest.mark.thorough), "tube", MAP])
+@pytest.mark.thorough
 def test_translations_are_zero_modes_only_where_the_surface_is_homogeneous(flat, name):
     (make, number), free = SURFACES[name], name == "tube"
     tissue, energy = flat.with_surface(make(number)), elastic(jnp.ones(2))
@@ -181,6 +183,7 @@ def test_members_of_a_batch_of_surfaces_are_those_one_by_one(flat):
     np.testing.assert_allclose(together, [run(h) for h in heights], rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_float32_comes_to_rest(flat):
     to_single = lambda x: x.astype(np.float32) if x.dtype == np.float64 else x
     tissue, energy = flat.with_surface(Cylinder(SIDE / (2 * np.pi))), elastic(jnp.ones(2))

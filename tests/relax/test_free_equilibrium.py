@@ -65,7 +65,7 @@ def test_two_cells_without_interfacial_tension_are_one_drop(gamma):
     np.testing.assert_allclose(K * (1 - tissue.areas), gamma / radius, rtol=1e-8)
 
 
-@pytest.mark.parametrize("inner_arcs", [False, True])
+@pytest.mark.parametrize("inner_arcs", [pytest.param(False, marks=pytest.mark.thorough), True])
 @pytest.mark.parametrize("ratio", [0.4, 1.0, 1.7])
 def test_symmetric_doublet(ratio, inner_arcs):
     # γ_int = 2 γ cos θ, A = R² (π - θ + sin θ cos θ), K (A0 - A) = γ / R.

@@ -35,6 +35,7 @@ def test_overlaps_of_the_start_that_remain_end_the_search():
     assert equilibrium.num_steps == 100
 
 
+@pytest.mark.thorough
 def test_overlaps_of_the_start_may_resolve():
     tissue = overlapping(2)
     equilibrium = RELAXATION(tissue, energy_of(tissue, TENSIONS[0]))

@@ -233,6 +233,7 @@ def test_another_number_compiles_nothing():
     assert not compiled
 
 
+@pytest.mark.thorough
 def test_a_compiled_gradient_is_cached_on_disk():
     # JAX keeps no program that calls back to the host, as an error raised within it does.
     tissue, adjoint = random_tissue(6, 0), vx.ImplicitDifferentiation(throw=False)
@@ -399,6 +400,7 @@ def test_an_energy_may_depend_on_absolute_positions(boundary):
     np.testing.assert_allclose(jnp.mean(stays.vertices - tissue.vertices, axis=0), 0, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_a_second_call_checks_no_numbers_and_traces_nothing(monkeypatch):
     traces = []
 

@@ -421,6 +421,7 @@ main()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to a process")
+@pytest.mark.thorough
 def test_an_interrupt_while_compiling_ends_with_its_exit_code(tiny):
     # Without the cache that other tests share, or it would not compile.
     cached = ("JAX_COMPILATION_CACHE_DIR", "VERTAX_CACHE")

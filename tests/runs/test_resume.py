@@ -138,6 +138,7 @@ def test_a_run_of_another_configuration_is_not_resumed(finished, stopped):
     )
 
 
+@pytest.mark.thorough
 def test_a_finished_run_is_not_resumed(finished):
     outcome = vertax("run", finished / "tiny.toml", "--resume", finished / "run")
     assert outcome.exit_code == 2

@@ -129,6 +129,7 @@ def test_an_interrupt_ends_fits_in_other_threads_after_their_epoch(tmp_path):
     assert {part.stem for part in (tmp_path / "unfinished").iterdir()} >= {"x_0"}
 
 
+@pytest.mark.thorough
 def test_concurrent_fits_equal_sequential_fits(tmp_path):
     problems = [problem(3.6), problem(3.7)]
     notes = lambda problem, record: {"twice": 2 * record.cost}

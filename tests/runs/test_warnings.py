@@ -56,6 +56,7 @@ def test_a_run_without_warnings_has_no_such_key(tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text()) == {"cost": 1.0}
 
 
+@pytest.mark.thorough
 def test_least_squares_without_convergence_are_a_warning(tmp_path, monkeypatch):
     # What counts is the number of epochs, and those of Adam compile much less.
     monkeypatch.setattr(_folder, "fit", lambda p, _, n, **options: vx.fit(p, ADAM, n, **options))
@@ -76,6 +77,7 @@ def broken(monkeypatch):
 
 
 @pytest.mark.usefixtures("broken")
+@pytest.mark.thorough
 def test_a_failed_fit_keeps_its_epochs(tmp_path):
     folder, optimiser = RunFolder(tmp_path), ADAM
     with pytest.raises(vx.FitError):

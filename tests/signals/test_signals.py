@@ -136,6 +136,7 @@ class TestExchange:
         concentrations = after(signals, vx.initialise.hexagonal(2, 2), 0.5)
         np.testing.assert_allclose(concentrations, np.repeat(exact[:, None], 4, 1), rtol=1e-6)
 
+    @pytest.mark.thorough
     def test_float32(self):
         tissue = jax.tree.map(
             lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, random_tissue(6, 0)
@@ -318,6 +319,7 @@ class TestEvolution:
         np.testing.assert_array_equal(continued.signals, uninterrupted.signals)
         np.testing.assert_array_equal(continued.tissue.vertices, uninterrupted.tissue.vertices)
 
+    @pytest.mark.thorough
     def test_concentrations_are_in_trajectories_and_files(self, tmp_path):
         movie = evolve(Signals(Turnover(0.5), [0.1, 0.2], initial=[1.0, 0.5]))
         vx.io.save_trajectory(tmp_path / "movie.npz", movie.trajectory)
@@ -330,6 +332,7 @@ class TestEvolution:
             tmp_path / "movie.pvd", movie.trajectory, cells={"activator": movie.signals[:, 0]}
         )
 
+    @pytest.mark.thorough
     def test_a_failed_solver_is_a_result(self):
         class Explosion(AbstractReaction):
             def __call__(self, concentrations, cells, time):
@@ -342,6 +345,7 @@ class TestEvolution:
 
 
 class TestTransitions:
+    @pytest.mark.thorough
     def test_neighbours_share_the_amount_of_a_cell_that_vanishes(self):
         tissue = random_tissue(9, 1).with_capacity(11)
         start = jnp.arange(1.0, 12.0)[None] + jnp.zeros((2, 1))
@@ -361,6 +365,7 @@ class TestTransitions:
         )
         assert (signals.record(ended, removed)[:, ~np.asarray(removed.alive)] == 0).all()
 
+    @pytest.mark.thorough
     def test_daughters_share_amounts_by_area(self):
         tissue = random_tissue(9, 1).with_capacity(11)
         signals = Signals(None, [0.1, 0.1], initial=[2.0, 3.0], diluted=(True, False))

@@ -43,7 +43,9 @@ def judged(g, proposal, product, bounds):
     return jnp.vdot(g, proposal.step), far, wrong
 
 
-@pytest.mark.parametrize("concave", [0, 0.25, 0.75])
+@pytest.mark.parametrize(
+    "concave", [0.25, *(pytest.param(x, marks=pytest.mark.thorough) for x in (0, 0.75))]
+)
 def test_steps_descend_within_their_bounds(concave):
     def one(key):
         g, matrix, bounds = model(key, concave)

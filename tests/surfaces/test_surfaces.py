@@ -89,6 +89,7 @@ def test_height_maps_have_two_continuous_derivatives_at_pixels_and_at_the_rim(x)
 SURFACES_AT_ONE = HeightMap(HEIGHTS, 1.0)
 
 
+@pytest.mark.thorough
 def test_smoothing_attenuates_a_wave_as_documented():
     n, sigma, wavelength = 64, 0.8, 8.0
     x = pixel_centres((4, n), 0.25)
@@ -99,6 +100,7 @@ def test_smoothing_attenuates_a_wave_as_documented():
     np.testing.assert_allclose(heights_of(surface, x), factor * wave, atol=1e-3)
 
 
+@pytest.mark.thorough
 def test_unknown_pixels_are_filled_from_those_around():
     x = np.asarray(pixel_centres((30, 30), 0.5))
     picture = 0.2 * x[..., 0] + 5
@@ -119,6 +121,7 @@ def test_heights_are_differentiable():
     assert float(slope) == pytest.approx(float(difference), rel=1e-7)
 
 
+@pytest.mark.thorough
 def test_a_cap_has_a_finite_slope_beyond_its_rim():
     cap = SphericalCap(2.0)
     height = lambda x: cap.points(jnp.array([x, 0.0]))[2]

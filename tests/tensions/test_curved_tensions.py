@@ -99,6 +99,7 @@ def test_normal_loads_are_those_of_a_membrane(lifted):
     assert table["normal_load"][inner].sum() / expected.sum() == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.thorough
 def test_a_flat_height_map_changes_nothing(plane):
     plain = infer_tensions(plane, pixel_size=1.0)
     flat = infer_tensions(plane, pixel_size=1.0, height=np.full(plane.shape, 3.0))
@@ -144,6 +145,7 @@ def test_tensions_on_a_sphere_are_as_accurate_as_in_the_plane():
     assert np.mean(np.abs(scores) < 1.96) > 0.85
 
 
+@pytest.mark.thorough
 def test_tensions_of_a_tissue_on_a_surface_use_its_surface():
     tissue = vx.initialise.free_voronoi(20, key=0)
     planar = vx.Tissue(tissue.vertices, tissue.topology, tissue.boundary)

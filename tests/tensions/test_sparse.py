@@ -87,6 +87,7 @@ def system_of(course, straight, prior=None):
         ("movie_4", None, False, 0.4),
     ],
 )
+@pytest.mark.thorough
 def test_the_sparse_solution_is_the_dense_one(name, pixels, straight, prior):
     foam = read_surface_evolver(DATA / f"{name}.dmp")
     if pixels is None:

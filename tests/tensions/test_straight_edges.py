@@ -71,6 +71,7 @@ def test_arcs_are_chosen_where_edges_are_arcs(foam):
     assert infer_tensions(foam[0], edges="straight").edges == "straight"
 
 
+@pytest.mark.thorough
 def test_mean_stress_of_a_stretched_tissue_is_along_the_tension(straight):
     tissue = straight[0]
     pulled = tissue.with_vertices(tissue.vertices * jnp.array([1.3, 1 / 1.3]))

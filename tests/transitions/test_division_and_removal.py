@@ -79,6 +79,7 @@ def test_default_cut_is_perpendicular_to_the_long_axis():
         assert (halves > 0.3 * tissue.areas[mother]).all()
 
 
+@pytest.mark.thorough
 def test_repeated_divisions_of_a_periodic_cell():
     tissue = random_tissue(1).with_capacity(12)
 
@@ -289,6 +290,7 @@ def test_neighbours_fill_the_area_of_a_removed_cell(kind):
         *(pytest.param(s, marks=pytest.mark.thorough) for s in [(2, 1), (1, 2), (3, 1), (2, 2)]),
     ],
 )
+@pytest.mark.thorough
 def test_removal_from_a_small_box_terminates(shape, without_type_checks):
     # A cell that is its own neighbour may gain a side in the flip by which it loses one.
     tissue = vx.initialise.hexagonal(*shape)

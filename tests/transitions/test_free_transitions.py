@@ -70,6 +70,7 @@ def inner_edges_at_the_outline(tissue):
     return np.flatnonzero(((start == n) ^ (end == n)) & ~np.asarray(tissue.topology.on_outline))
 
 
+@pytest.mark.thorough
 def test_an_inner_edge_can_become_an_arc_and_return():
     tissue = cluster(12, 1, lloyd_steps=3)
     rule = vx.T1(threshold=0.02)
