@@ -84,6 +84,7 @@ SHORT = {
     "tissue_moduli": "shape_factors=[3.5,3.7] replicates=2 tissue.n_cells=9",
     "trained_stresses": "trained=[1,4] replicates=1 tissue.n_cells=4 fit.epochs=2",
     "wing_posteriors": "wings=1 draws=20 warmup=60 synthetic_noise=[0.01]",
+    "random_walk": "frames=40 replicates=3",
 }
 
 
