@@ -85,6 +85,7 @@ SHORT = {
     "trained_stresses": "trained=[1,4] replicates=1 tissue.n_cells=4 fit.epochs=2",
     "wing_posteriors": "wings=1 draws=20 warmup=60 synthetic_noise=[0.01]",
     "random_walk": "frames=40 replicates=3",
+    "monolayer": "duration=4 frames=4 room=12 divisions=2",
     "wound_healing": "columns=8 rows=8 frames=12 duration=1",
 }
 
