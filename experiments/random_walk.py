@@ -131,7 +131,7 @@ def correlation(config: Config, velocities: np.ndarray) -> np.ndarray:
 
 def recover(config: Config, velocities: np.ndarray) -> tuple[float, float]:
     """Persistence time and bias from the velocities of the paths."""
-    drift = np.clip(velocities[..., 0].mean() / config.speed, mean_cosine(0), 0.999)
+    drift = np.clip(velocities[..., 0].mean() / config.speed, mean_cosine(0.0), 0.999)
     model = lambda lag, tau: drift**2 + (1 - drift**2) * np.exp(-lag / tau)
     (tau,), _ = curve_fit(model, config.step * LAGS, correlation(config, velocities), p0=10 * config.step)
     bias: Any = brentq(lambda b: mean_cosine(b) - drift, 0, 0.9999)

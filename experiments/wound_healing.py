@@ -107,7 +107,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     results: Any = [fit.energy, fit.deviation]
     fitted, errors = ([e.energy.terms[0].target_area, e.energy.terms[2].tension] for e in results)
     folder.save_table("wound", {"time": times, "area": areas})
-    folder.save_figure("wound", plot_wound(frames, hole, times, areas, used[-1]))
+    folder.save_figure("wound", plot_wound(frames, hole, times, areas, int(used[-1])))
     return {
         "cells": int(np.sum(wounded.alive)) - 1,
         "area": float(areas[0]),
@@ -133,10 +133,10 @@ def first_below(times: np.ndarray, left: np.ndarray, part: float) -> float:
 def plot_wound(frames: list[vx.Tissue], hole: Any, times: np.ndarray, areas: np.ndarray, last: int) -> Any:
     """Three frames in the colours of the areas of cells, and the area of the wound in time."""
     figure, (axes,) = plotting.new_figure(1, 4, width=[2.0, 2.0, 2.0, 2.4], height=2.2, room=0.6)
-    chosen = [0, last, len(frames) - 1]
+    chosen = np.unique([0, last, len(frames) - 1])
     tissues = {f"time {times[k]:.3g}": frames[k] for k in chosen}
     values = [np.where(hole, np.nan, np.asarray(frames[k].areas)) for k in chosen]
-    plotting.plot_tissues(tissues, values, axes=axes[:3], label="area")
+    plotting.plot_tissues(tissues, values, axes=axes[: len(chosen)], label="area")
     axes[3].semilogy(times, areas, color=plotting.SERIES[0])
     axes[3].axvspan(0, times[last], color=plotting.SERIES[0], alpha=0.12, lw=0, label="fitted")
     axes[3].set(xlabel="time", ylabel="area of the wound")
