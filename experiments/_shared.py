@@ -1,5 +1,6 @@
 """Functions that several experiments use."""
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -90,3 +91,15 @@ def spread_of(values: Float[np.ndarray, " *values"]) -> dict[str, float]:
     """Mean and standard deviation, for metrics."""
     values = np.asarray(values, float)
     return {"mean": float(values.mean()), "deviation": float(values.std())}
+
+
+def processor_time(compute: Callable[[], Any]) -> tuple[Any, float]:
+    """The result of a function, and the processor time of all its threads in seconds."""
+    began = time.process_time()
+    result = compute()
+    return result, time.process_time() - began
+
+
+def comparison(value: Any, error: Any, true: float) -> dict[str, float]:
+    """A measured value with its standard error beside the true one, for metrics."""
+    return {"value": float(value), "error": float(error), "true": float(true)}

@@ -10,7 +10,8 @@ with the traction χ per concentration, and the geometry m of the contacts betwe
 n, vector d between the two centroids, and the area A of the cluster; m → 1 for large clusters.
 
 Self-propulsion in random directions adds noise. The chemotactic index is the displacement of the centre of
-mass along the gradient, divided by the length of its path, with one point for each frame.
+mass along the gradient, divided by the length of its path, with one point for each frame. The traction is
+recovered from the tracks of the runs with noise and the geometry of the contacts in their frames.
 """
 
 import time
@@ -24,6 +25,7 @@ from pydantic import Field
 from scipy.integrate import odeint
 
 import vertax as vx
+from experiments._shared import comparison
 from vertax import energies, plotting, runs
 from vertax.plotting import INK, SERIES
 
@@ -112,7 +114,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     energy = energies.AreaElasticity(10.0, 1.0) + energies.PerimeterElasticity(1.0, 3.6)
     rest = vx.equilibrate(tissue, energy).tissue
     rest = rest.with_vertices(rest.vertices - centre(rest))
-    times = np.linspace(0, config.duration, config.frames + 1)
+    times, spent = np.linspace(0, config.duration, config.frames + 1), []
 
     def evolve(profile: int, gradient: float, propulsion: float, key: int) -> tuple[Any, np.ndarray]:
         sensing = Sensing(jnp.asarray(config.sensing_rate), jnp.asarray(gradient), jnp.asarray(profile))
@@ -125,6 +127,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             diluted=False,
             deterministic=False,
         )
+        worked = time.process_time()
         movie = vx.evolve(
             rest,
             energy,
@@ -137,6 +140,7 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         )
         if not movie.converged:
             folder.warn(f"{PROFILES[profile]}, gradient {gradient:g}: {vx.RESULTS[movie.result]}")
+        spent.append(time.process_time() - worked)
         return movie, np.array([centre(frame) for frame in movie.trajectory])
 
     mobility = config.traction / config.friction * contact_geometry(rest)
@@ -148,16 +152,19 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
             lambda x, _, slope=slope: mobility * slope(x[0])[None], [0.0], times
         )[:, 0]
     movie: Any
-    rows, movie, path = [], None, np.zeros((1, 2))
+    rows, geometries, movie, path = [], [], None, np.zeros((1, 2))
     for factor in config.factors:
         for key in range(config.replicates):
             gradient = factor * config.gradient
-            movie, path = evolve(0, gradient, config.propulsion, config.seed + key)
+            movie, path = evolve(0, gradient, config.propulsion, config.seed + len(rows))
             length = np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1))
             moved = path[-1, 0] - path[0, 0]
-            rows.append((gradient, key, moved / config.duration, moved / length))
+            net = np.linalg.norm(path[-1] - path[0])
+            rows.append((gradient, key, moved / config.duration, moved / length, net / length))
+            geometries.append(np.mean([contact_geometry(frame) for frame in movie.trajectory]))
+    names = ("gradient", "replicate", "speed", "index", "directionality")
     columns = map(np.array, zip(*rows, strict=True))
-    noisy: dict[str, Any] = dict(zip(("gradient", "replicate", "speed", "index"), columns, strict=True))
+    noisy: dict[str, Any] = dict(zip(names, columns, strict=True))
     noisy["speed_theory"] = mobility * noisy["gradient"]
     folder.save_table("fields", fields)
     folder.save_table("noise", noisy)
@@ -168,6 +175,10 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         vx.animate(movie.trajectory, file, values, mark_t1=0, dpi=90, label="concentration sensed")
     steepest = noisy["gradient"] == noisy["gradient"].max()
     linear = np.polyfit(times, fields["linear"], 1)[0]
+    # Least squares through the origin: speed = χ q with q = m dc/dx / ζ.
+    q = np.array(geometries) * noisy["gradient"] / config.friction
+    traction = np.sum(q * noisy["speed"]) / np.sum(q**2)
+    scatter = np.sum((noisy["speed"] - traction * q) ** 2) / max(len(q) - 1, 1)
     return {
         "speed": float(linear),
         "speed_of_theory": float(mobility * config.gradient),
@@ -175,6 +186,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         "displacements_of_theory": {name: float(fields[f"{name}_theory"][-1]) for name in PROFILES},
         "index_in_the_steepest_gradient": float(np.mean(noisy["index"][steepest])),
         "index_without_gradient": float(np.mean(noisy["index"][noisy["gradient"] == 0])),
+        "directionality_in_the_steepest_gradient": float(np.mean(noisy["directionality"][steepest])),
+        "traction": comparison(traction, np.sqrt(scatter / np.sum(q**2)), config.traction),
+        "seconds_per_step": float(np.median(spent)) / config.frames / config.substeps,
         "seconds": time.perf_counter() - began,
     }
 

@@ -11,13 +11,17 @@ import time
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.stats import norm
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import NullFormatter
 from pydantic import Field
+from scipy.optimize import minimize
 
 import vertax as vx
+from experiments._shared import comparison, processor_time
 from vertax import energies, plotting, runs
 from vertax.plotting import INK, SERIES
 
@@ -60,6 +64,8 @@ class Config(runs.ExperimentConfig):
     """Relaxation of each step."""
     animation: bool = True
     """Draw an animation."""
+    monolayer: bool = False
+    """Report the quantities of OpenVT's reference model, recover the growth rate, and time the steps."""
 
 
 class Energy(eqx.Module):
@@ -87,8 +93,13 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
     options: Any = {name: getattr(config, name) for name in ("substeps", "divisions")}
     options |= {"key": config.seed, "relaxation": relaxation, "throw": False}
     times = jnp.linspace(0, config.duration, config.frames + 1)
-    grown = vx.growth.grow(straight.with_capacity(config.room), energy, cycle, times, **options)
+    grow = lambda: vx.growth.grow(straight.with_capacity(config.room), energy, cycle, times, **options)
+    grown = grow()
     seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - worked
+    monolayer = {}
+    if config.monolayer:
+        _, again = processor_time(lambda: np.asarray(grow().n_alive))
+        monolayer["seconds_per_step"] = again / config.frames / config.substeps
     full = bool(grown.result == vx.RESULTS.capacity_reached)
     if full:
         folder.warn(f"There was no room for more than {config.room} cells: raise `room`.")
@@ -116,7 +127,9 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         vx.animate(grown.trajectory, file, sides, captions=captions, mark_t1=0, dpi=90, **COLOURS)
     last, inner = counts[-1], max(int(counts[-1].sum()), 1)
     classes = {int(n): float(count / inner) for n, count in zip(SIDES, last, strict=True)}
-    return {
+    if config.monolayer:
+        monolayer |= monolayer_of(config, folder, frames, times, n_cells, lineage)
+    return monolayer | {
         "cells": int(n_cells[-1]),
         "inner_cells": int(last.sum()),
         "pentagons": classes[5],
@@ -132,6 +145,63 @@ def run(config: Config, folder: runs.RunFolder, *, progress: bool = True) -> dic
         "growth_cpu_seconds": cpu_seconds,
         "seconds": time.perf_counter() - began,
     }
+
+
+def monolayer_of(config: Config, folder: runs.RunFolder, *movie: Any) -> dict[str, Any]:
+    """Doublings per cycle, radius and roughness of the outline, and the growth rate with its true value.
+
+    A cycle is the time in which a cell grows from half of the division area to the division area. The unit of
+    the radius is that of a disc with the division area.
+    """
+    frames, times, n_cells, lineage = movie
+    cycles = times * config.growth_rate / (config.division_area / 2)
+    lengths = [float(jnp.sum(jnp.where(f.topology.on_outline, f.edge_lengths, 0))) for f in frames]
+    areas = np.array([float(jnp.sum(jnp.where(f.alive, f.areas, 0))) for f in frames])
+    radius, roughness = np.sqrt(areas / config.division_area), lengths / (2 * np.sqrt(np.pi * areas))
+    table = {"cycles": cycles, "cells": n_cells, "radius": radius, "roughness": roughness}
+    folder.save_table("monolayer", table)
+    folder.save_figure("monolayer", plot_monolayer(table))
+    doublings = np.polyfit(cycles, np.log2(n_cells), 1)[0]
+    fitted, error = recover_growth_rate(config, lineage, times[-1])
+    return {
+        "cycles": float(cycles[-1]),
+        "doublings_per_cycle": float(doublings),
+        "radius": float(radius[-1]),
+        "roughness": float(roughness[-1]),
+        "growth_rate": comparison(fitted, error, config.growth_rate),
+    }
+
+
+def recover_growth_rate(config: Config, lineage: dict[str, np.ndarray], end: float) -> tuple[float, float]:
+    """The growth rate of greatest likelihood from the times of divisions, and its standard error.
+
+    A cell divides at a normally distributed size, and daughters have half the size of their mother. The sizes
+    of the founders at division are parameters too. On average a division is found half a step late.
+    """
+    half_step = config.duration / config.frames / config.substeps / 2
+    mother, divided = lineage["mother"], lineage["fate"] == 1
+    spans = np.where(divided, lineage["ended"] - half_step, end) - lineage["begun"]
+    founders = np.flatnonzero((mother < 0) & divided)
+    width = max(config.variation, 0.01) * config.division_area
+    depth = np.zeros(len(mother), int)
+    for cell in np.flatnonzero(mother >= 0):  # a mother has a lower index
+        depth[cell] = depth[mother[cell]] + 1
+    generations = [np.flatnonzero(depth == k) for k in range(1, depth.max() + 1)]
+
+    def loss(parameters: Any) -> Any:
+        rate, sizes = parameters[0], jnp.zeros(len(mother)).at[founders].set(parameters[1:])
+        total = jnp.sum(norm.logpdf(parameters[1:], config.division_area, width))
+        for cells in generations:
+            size = (sizes[mother[cells]] + rate * half_step) / 2 + rate * spans[cells]
+            density, survival = (f(size, config.division_area, width) for f in (norm.logpdf, norm.logsf))
+            total += jnp.sum(jnp.where(divided[cells], jnp.log(rate) + density, survival))
+            sizes = sizes.at[cells].set(size)
+        return -total
+
+    start = np.append(0.9 * config.growth_rate, np.full(len(founders), config.division_area))
+    fit = minimize(jax.jit(loss), start, jac=jax.jit(jax.grad(loss)), method="BFGS")
+    covariance = np.linalg.inv(jax.hessian(loss)(jnp.asarray(fit.x)))
+    return float(fit.x[0]), float(np.sqrt(covariance[0, 0]))
 
 
 def polygon_classes(tissue: vx.Tissue) -> np.ndarray:
@@ -189,6 +259,22 @@ def plot_classes(counts: np.ndarray, n_cells: np.ndarray, chain: np.ndarray) -> 
     right.set(xlabel="cells", ylabel="share of inner cells", ylim=(0, 0.75), xscale="log")
     right.xaxis.set_minor_formatter(NullFormatter())
     right.legend(loc="upper left")
+    return figure
+
+
+@plotting.house_style()
+def plot_monolayer(table: dict[str, np.ndarray]) -> Any:
+    """The number of cells, and the radius and the roughness of the outline, against time in cycles."""
+    figure, ((left, middle, right),) = plotting.new_figure(1, 3, width=2.4)
+    cycles, cells = table["cycles"], table["cells"]
+    left.semilogy(cycles, cells, color=SERIES[0], base=2, label="grown")
+    left.semilogy(cycles, cells[0] * 2**cycles, ":", color=INK, lw=0.9, base=2, label="2 per cycle")
+    left.set(xlabel="time in cycles", ylabel="cells")
+    left.legend()
+    middle.plot(cycles, table["radius"], color=SERIES[0])
+    middle.set(xlabel="time in cycles", ylabel="radius in cell radii", ylim=(0, None))
+    right.plot(cycles, table["roughness"], color=SERIES[0])
+    right.set(xlabel="time in cycles", ylabel="roughness", ylim=(1, None))
     return figure
 
 
