@@ -100,7 +100,7 @@ class TestTissues:
             (["small"], {"cells": [np.zeros(7)]}, r"`cells` must have shape \(6,\)"),
             (["small"], {"edges": [np.zeros(7)]}, r"`edges` must have shape \(18,\)"),
             (["small"], {"mask": np.ones(7, bool)}, r"`mask` must have shape \(6,\)"),
-            (["small"], {"colorbar": "edge"}, "`colorbar` must be true, false,"),
+            (["small"], {"colorbar": "edge"}, "`colorbar` must be one of True, False,"),
             (["small"], {"axes": []}, "`axes` must have one entry for each of the 1 panels"),
             (["small"], {"image": np.zeros(4)}, "`image` must have shape"),
         ],

@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from vertax._base.checks import check_integer, check_number
+from vertax._base.checks import check_choice, check_integer, check_number
 from vertax.energies import AbstractEnergy
 from vertax.external._evolver_datafile import datafile, spacing_commands
 from vertax.external._evolver_model import Terms, parameter_derivatives
@@ -74,10 +74,7 @@ class SurfaceEvolver(AbstractSimulator):
     t1: float | None = None
 
     def __post_init__(self) -> None:
-        if self.areas not in ("elastic", "fixed"):
-            raise ValueError(
-                f"Argument `areas` must be 'elastic' or 'fixed', but is {self.areas!r}."
-            )
+        check_choice("areas", self.areas, ("elastic", "fixed"))
         for name in ("tolerance", "timeout"):
             check_number(name, getattr(self, name), above=0)
         if self.t1 is not None:

@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from vertax._base.checks import check_integer, check_number, describe
+from vertax._base.checks import check_choice, check_integer, check_number, describe
 from vertax._base.model_checks import check_energy, check_planar
 from vertax._base.results import RESULTS
 from vertax._base.scales import Scales
@@ -89,11 +89,7 @@ class External(AbstractResponse):
                 "Argument `simulator` must be an instance of a subclass of "
                 f"vertax.external.AbstractSimulator, but is {describe(self.simulator)}."
             )
-        if self.slope not in ("energy", "program", "differences"):
-            raise ValueError(
-                "Argument `slope` must be 'energy', 'program' or 'differences', but is "
-                f"{self.slope!r}."
-            )
+        check_choice("slope", self.slope, ("energy", "program", "differences"))
         if self.slope != "energy" and self.stiffness is None:
             raise ValueError(
                 "Argument `stiffness` is missing: it is the unit of the nudge, and is computed from the "

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax._base.atomic import atomic_draft
+from vertax._base.checks import check_number
 from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._colours import Colours, add_bar
@@ -167,8 +168,7 @@ def _check(
             f"shapes {sorted(sizes)}."
         )
     _check_timing(fps, last_frame_seconds, dpi)
-    if not mark_t1 >= 0:
-        raise ValueError(f"Argument `mark_t1` must not be negative, but is {mark_t1}.")
+    check_number("mark_t1", mark_t1, at_least=0)
     if captions is not None and len(captions) != len(frames):
         raise ValueError(
             f"Argument `captions` must have one text for each of the {len(frames)} frames, but has "
@@ -177,13 +177,9 @@ def _check(
 
 
 def _check_timing(fps: float, last_frame_seconds: float, dpi: int) -> None:
-    for name, value in (("fps", fps), ("dpi", dpi)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
-    if not last_frame_seconds >= 0:
-        raise ValueError(
-            f"Argument `last_frame_seconds` must not be negative, but is {last_frame_seconds}."
-        )
+    check_number("fps", fps, above=0)
+    check_number("dpi", dpi, above=0)
+    check_number("last_frame_seconds", last_frame_seconds, at_least=0)
 
 
 def _cell_values(cells: CellValues | None, frames: list[Tissue]) -> np.ndarray | None:

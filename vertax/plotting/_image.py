@@ -11,6 +11,7 @@ from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from vertax._base.checks import check_number
 from vertax._base.pixels import PixelSizeLike, check_pixel_size, pixel_sides
 from vertax.plotting import _style
 
@@ -138,9 +139,9 @@ def scale_bar(
 
     - `ValueError` if a length is not positive.
     """
-    for name, value in (("unit_length", unit_length), ("length", length)):
-        if value is not None and not (np.isfinite(float(value)) and float(value) > 0):
-            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+    check_number("unit_length", unit_length, above=0)
+    if length is not None:
+        check_number("length", length, above=0)
     unit_length = float(unit_length)
     left, right = sorted(ax.get_xlim())
     length = float(_round_length((right - left) / unit_length / 4) if length is None else length)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
+from vertax._base.checks import check_number
 from vertax.mesh import Drawing, Periodic, Tissue
 from vertax.plotting import _style
 from vertax.plotting._tissue import plot_tissue, single
@@ -121,6 +122,5 @@ def _unit(sizes: np.ndarray, scale: SupportsFloat | None) -> float:
     """The size that is drawn as long as a cell: by default the largest, or 1 if all are 0."""
     if scale is None:
         return float(sizes.max()) or 1.0
-    if not float(scale) > 0:
-        raise ValueError(f"Argument `scale` must be positive, but is {scale}.")
+    check_number("scale", scale, above=0)
     return float(scale)

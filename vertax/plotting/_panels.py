@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
+from vertax._base.checks import check_choice
 from vertax._base.pixels import PixelSizeLike
 from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
@@ -152,10 +153,7 @@ def plot_tissues(
 def _check(
     tissues: Mapping[str, Tissue | None], axes: Any, image: np.ndarray | None, colorbar: bool | str
 ) -> None:
-    if colorbar not in (True, False, "cells", "edges"):
-        raise ValueError(
-            f'Argument `colorbar` must be true, false, "cells" or "edges", but is {colorbar!r}.'
-        )
+    check_choice("colorbar", colorbar, (True, False, "cells", "edges"))
     if not tissues:
         raise ValueError("Argument `tissues` must have at least one panel, but is empty.")
     if image is None and None in tissues.values():

@@ -14,7 +14,7 @@ from jaxtyping import Array, Int, Shaped
 from vertax._base.announce import announce_compilations
 from vertax._base.available_memory import check_memory
 from vertax._base.blas import one_blas_thread
-from vertax._base.checks import check_number, describe
+from vertax._base.checks import check_choice, check_number, describe
 from vertax._base.phases import phases, start_phase
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport, Segmentation, from_labels
@@ -132,10 +132,7 @@ def infer_tensions(
     for name, value in (("noise", noise), ("prior", prior), ("plane_distance", plane_distance)):
         if value is not None:
             check_number(name, value, above=0)
-    if edges not in (None, "arcs", "straight"):
-        raise ValueError(
-            f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
-        )
+    check_choice("edges", edges, ("arcs", "straight", None))
     start_phase("reading")
     source, sized = mask, pixel_size is not None
     if isinstance(source, str | os.PathLike) and is_surface_evolver(Path(source)):

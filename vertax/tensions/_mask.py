@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label
 
-from vertax._base.checks import check_integer
+from vertax._base.checks import check_choice, check_integer
 from vertax.initialise._mask_arguments import (
     check_bits,
     check_no_picture,
@@ -21,7 +21,6 @@ from vertax.initialise._mask_arguments import (
 from vertax.initialise._pieces import connected_pieces
 from vertax.io._image import read_colours
 
-_KINDS = ("auto", "labels", "outlines")
 # A region at the border of the image that is larger than this, relative to the median cell, is no cell.
 _OUTSIDE = 5.0
 # A region smaller than this, relative to the median cell, is no cell either.
@@ -77,10 +76,7 @@ def labels_and_lines(
     plane: int | None,
 ) -> tuple[Int[np.ndarray, "rows columns"], float]:
     """The labels of [`read_mask`][vertax.tensions.read_mask], and the width of the lines in pixels, or 0."""
-    if kind not in _KINDS:
-        raise ValueError(
-            f"Argument `kind` must be one of {', '.join(map(repr, _KINDS))}, but is {kind!r}."
-        )
+    check_choice("kind", kind, ("auto", "labels", "outlines"))
     if plane is not None:
         check_integer("plane", plane, at_least=0)
     if isinstance(mask, str | os.PathLike):
