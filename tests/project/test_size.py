@@ -31,8 +31,8 @@ LINES = {
     "signals": 559,
     "solvers": 2296,
     "surfaces": 630,
-    "tensions": 4354,
-    "tests": 31924,
+    "tensions": 4300,
+    "tests": 31923,
     "transitions": 1327,
 }
 # Largest number of lines of a file, and of the files that have more.

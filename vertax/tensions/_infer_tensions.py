@@ -25,8 +25,8 @@ from vertax.io._surface_evolver import is_surface_evolver
 from vertax.mesh import Tissue, geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import equations
-from vertax.tensions._curves import Points
-from vertax.tensions._edges import fit, solution
+from vertax.tensions._curves import Points, read_courses
+from vertax.tensions._edges import solution, vertices_only
 from vertax.tensions._inferred import InferredTensions
 from vertax.tensions._lift import lifted
 from vertax.tensions._mask import labels_and_lines, load_array
@@ -194,7 +194,11 @@ def infer_tensions(
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
     start_phase("geometry")
-    curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
+    if len(points.edge):
+        options = {"apart": course.apart, "noise": course.noise}
+        curves = read_courses(geometry, points, course.grain, **options)
+    else:
+        curves = vertices_only(geometry, course.noise or course.grain)
     start_phase("balance")
     if surface is not None:
         geometry = geometry._replace(lift=lifted(geometry, curves.change, surface))
