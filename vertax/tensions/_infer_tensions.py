@@ -29,9 +29,16 @@ from vertax.tensions._curves import Points, read_courses
 from vertax.tensions._edges import solution, vertices_only
 from vertax.tensions._inferred import InferredTensions
 from vertax.tensions._lift import lifted
-from vertax.tensions._mask import labels_and_lines, load_array
+from vertax.tensions._mask import labels_and_lines, read_pixels
 from vertax.tensions._observed_geometry import observed_geometry
-from vertax.tensions._outcome import outcome
+from vertax.tensions._outcome import (
+    assembled,
+    moved_by_fit,
+    outline_errors,
+    relative,
+    spread,
+    with_outline_of_mask,
+)
 
 # Noise of a tissue without an image, and of the points of a foam, relative to the cell diameter; and the
 # number of points of an edge without a course.
@@ -154,7 +161,7 @@ def infer_tensions(
         )
         source = _across_lines(source, line_width)
     if isinstance(height, str | os.PathLike):
-        height = _heights_of_file(Path(height))
+        height = read_pixels(Path(height), "height", read_image)
     if isinstance(source, Segmentation):
         surface = source.tissue.surface
         if height is not None:
@@ -214,18 +221,28 @@ def infer_tensions(
     start_phase("errors")
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
-    source = course.labels, course.pixel_size, four_fold, report
-    return outcome(tissue, course.points, curves, system.which, balance, source, surface)
-
-
-def _heights_of_file(file: Path) -> np.ndarray:
-    """The numbers in an image, or in a file of NumPy."""
-    if file.suffix.lower() == ".npy":
-        return load_array(file, "height")
-    try:
-        return read_image(file)
-    except ValueError as error:
-        raise ValueError(str(error).replace("`path`", "`height`")) from error
+    which, fitted = system.which, moved_by_fit(tissue, curves.change)
+    if report is not None:
+        fitted = with_outline_of_mask(fitted, course.points, curves.change, which.edges)
+    distance = outline_errors(fitted, course.points, curves.change)
+    return assembled(
+        fitted,
+        (which.edges, which.cells),
+        relative(balance, which, curves),
+        balance.posterior.covariances,
+        four_fold=four_fold,
+        surface=surface,
+        labels=np.asarray(course.labels),
+        noise=float(curves.noise * balance.errors.noise),
+        correlation=float(curves.apart),
+        bending=curves.bending,
+        edges="straight" if which.n_arcs == 0 else "arcs",
+        errors={name: float(value) for name, value in balance.errors._asdict().items()},
+        pixel_size=course.pixel_size,
+        mask_report=report,
+        short=spread(tissue.n_edges, which.edges, balance.loose, False),
+        outline_errors=distance / pixel_length(course.pixel_size or 1.0),
+    )
 
 
 class _Course(NamedTuple):

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vertax._base.pixels import PixelSize, pixel_length
-from vertax.initialise import MaskReport
 from vertax.mesh import Tissue, angle_of_area, geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import Equations
@@ -73,55 +71,6 @@ def is_determined(deviation: Float[np.ndarray, " tensions"]) -> Bool[np.ndarray,
     return deviation < _UNKNOWN
 
 
-def outcome(
-    tissue: Tissue,
-    points: Points,
-    curves: Fitted,
-    which: Equations,
-    balance: Balance,
-    source: tuple[
-        Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
-    ],
-    surface: AbstractSurface | None = None,
-) -> InferredTensions:
-    """The result as it is reported.
-
-    **Arguments:**
-
-    - `tissue`: the observed tissue.
-    - `points`: the points of all edges.
-    - `curves`: its fitted edges.
-    - `which`, `balance`: the equations and their solution.
-    - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
-    - `surface`: the surface of the tissue; None in the plane.
-
-    **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
-    """
-    labels, pixel_size, four_fold, report = source
-    tissue = _moved(tissue, curves.change)
-    if report is not None:
-        tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
-    return assembled(
-        tissue,
-        (which.edges, which.cells),
-        relative(balance, which, curves),
-        balance.posterior.covariances,
-        four_fold=four_fold,
-        surface=surface,
-        labels=np.asarray(labels),
-        noise=float(curves.noise * balance.errors.noise),
-        correlation=float(curves.apart),
-        bending=curves.bending,
-        edges="straight" if which.n_arcs == 0 else "arcs",
-        errors={name: float(value) for name, value in balance.errors._asdict().items()},
-        pixel_size=pixel_size,
-        mask_report=report,
-        short=_spread(tissue.n_edges, which.edges, balance.loose, False),
-        outline_errors=_outline_errors(tissue, points, curves.change)
-        / pixel_length(pixel_size or 1.0),
-    )
-
-
 def assembled(
     tissue: Tissue,
     places: tuple[Int[np.ndarray, " tensions"], Int[np.ndarray, " pressures"]],
@@ -151,7 +100,7 @@ def assembled(
     if surface is not None:
         measures = measured(tissue, surface)
         tangents, areas = measures.fabric, measures.areas
-        of_edges = _spread(tissue.n_edges, places[0], values.tension, np.nan)
+        of_edges = spread(tissue.n_edges, places[0], values.tension, np.nan)
         curved = _curved(tissue, of_edges, surface, measures)
     weights, included = stress_weights(tissue, *places, tangents, areas)
     components = weights @ np.concatenate([values.tension, values.pressure])
@@ -159,8 +108,8 @@ def assembled(
     n, lag = len(values.tension), weights @ values.lag
     weights[:, n:] -= weights[:, n:].mean(axis=1, keepdims=True)
     covariance = weights @ covariances(weights.T) + np.outer(lag, lag)
-    of_edges = lambda of, fill: _spread(tissue.n_edges, places[0], of, fill)
-    of_cells = lambda of, fill: _spread(tissue.n_cells, places[1], of, fill)
+    of_edges = lambda of, fill: spread(tissue.n_edges, places[0], of, fill)
+    of_cells = lambda of, fill: spread(tissue.n_cells, places[1], of, fill)
     tensions, pressures = of_edges(values.tension, np.nan), of_cells(values.pressure, np.nan)
     determined = of_edges(values.sure, False) & ~four_fold
     return InferredTensions(
@@ -201,14 +150,14 @@ def _curved(
     )
 
 
-def _spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
+def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
     """An array with values at some places."""
     array = np.full(size, fill)
     array[place] = of
     return array
 
 
-def _outline_errors(
+def outline_errors(
     tissue: Tissue, points: Points, change: Float[np.ndarray, " geometry"]
 ) -> Float[np.ndarray, " cells"]:
     """Root mean square distance of the points around each cell from its arcs."""
@@ -230,7 +179,7 @@ def _from_moved_vertices(
     return points.away - shift[geometry_of(tissue).edge_vertices[points.edge, 0]]
 
 
-def _with_outline_of_mask(
+def with_outline_of_mask(
     tissue: Tissue,
     points: Points,
     change: Float[np.ndarray, " geometry"],
@@ -256,7 +205,7 @@ def _with_outline_of_mask(
     return tissue.with_angles(jnp.asarray(angles, tissue.vertices.dtype))
 
 
-def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
+def moved_by_fit(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     """The tissue with the vertices and angles of the fit."""
     n = 2 * tissue.n_vertices
     dtype = tissue.vertices.dtype
