@@ -115,6 +115,11 @@ class AbstractSimulator(abc.ABC):
         return f"{type(self).__name__}({settings})"
 
 
+def clockwise(h: Int[np.ndarray, " half_edges"]) -> Int[np.ndarray, " half_edges"]:
+    """The next half-edge at the same vertex, clockwise."""
+    return np.where(h % 3 == 0, h + 2, h - 1)
+
+
 class Edges(NamedTuple):
     """The edges of a tissue as NumPy arrays: all that an energy of lengths, areas and perimeters needs."""
 
@@ -140,7 +145,6 @@ class Edges(NamedTuple):
         """
         m = tissue.topology
         twin, cell, frame, h = (np.asarray(x) for x in (m.twin, m.cell, m.frame, m.half_edge))
-        clockwise = lambda h: np.where(h % 3 == 0, h + 2, h - 1)
         lattice = np.zeros((2, 2))
         if isinstance(tissue.boundary, Periodic):
             lattice = np.asarray(tissue.boundary.lattice, float)
