@@ -10,11 +10,9 @@ from typing import Any, SupportsFloat, TypeAlias
 import numpy as np
 from jaxtyping import Array, Bool, Real
 from matplotlib.animation import FFMpegWriter, PillowWriter
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax._base.atomic import atomic_draft
 from vertax._base.checks import check_number
@@ -219,7 +217,11 @@ def _pictures(
     views = [view_of(drawing.polygons()[0], drawing.box) for drawing in drawings]
     low, high = np.min([v[0] for v in views], axis=0), np.max([v[1] for v in views], axis=0)
     with _style.house_style():
-        figure, ax = _figure(high - low, values is not None, captions is not None, dpi)
+        width, height = _style.size_of(high - low)
+        height += 0.25 * (captions is not None) + 0.1
+        room = 0.8 * (values is not None) + 0.1
+        figure, ((ax,),) = _style.new_figure(width=width, height=height, room=room)
+        figure.set_dpi(dpi)
         if values is not None:
             low_colour, high_colour = colours.limits(values)  # of all frames together
             colours = colours._replace(low=low_colour, high=high_colour)
@@ -252,14 +254,6 @@ def _placed(frames: list[Tissue]) -> list[Drawing]:
         near = drawings[-1].centroids if drawings else None
         drawings.append(Drawing(tissue, near=near))
     return drawings
-
-
-def _figure(extent: np.ndarray, bar: bool, caption: bool, dpi: int) -> tuple[Figure, Axes]:
-    width, height = _style.size_of(extent)
-    layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04)
-    size = (width + 0.8 * bar + 0.1, height + 0.25 * caption + 0.1)
-    figure = Figure(figsize=size, dpi=dpi, layout=layout)
-    return figure, figure.subplots()
 
 
 def _pixels(figure: Figure) -> np.ndarray:
