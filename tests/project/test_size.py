@@ -10,7 +10,7 @@ LINES = {
     "_base": 3211,
     "activities": 436,
     "adjoints": 988,
-    "bayes": 1090,
+    "bayes": 1079,
     "costs": 1639,
     "dissipations": 293,
     "dynamics": 1024,
@@ -31,14 +31,13 @@ LINES = {
     "signals": 559,
     "solvers": 2296,
     "surfaces": 630,
-    "tensions": 4239,
-    "tests": 31922,
+    "tensions": 4222,
+    "tests": 31921,
     "transitions": 1327,
 }
 # Largest number of lines of a file, and of the files that have more.
 LINES_OF_A_FILE = 400
 LONG_FILES = {
-    "bayes/_log_posterior.py": 403,
     "fitting/_inverse.py": 417,
     "initialise/_labels.py": 502,
     "initialise/_polygons.py": 588,

@@ -15,7 +15,7 @@ from vertax.tensions._balance import Equations
 from vertax.tensions._curves import Fitted, Points, arc_distances
 from vertax.tensions._inferred import CurvedGeometry, InferredTensions
 from vertax.tensions._lift import SurfaceMeasures, measured
-from vertax.tensions._mean_stress import fabric, mean_stress, stress_weights
+from vertax.tensions._mean_stress import fabric, mean_stress, stress_operators
 from vertax.tensions._solve import HIDDEN, Balance
 
 # A tension with a larger standard deviation, relative to the mean, is not determined.
@@ -102,7 +102,15 @@ def assembled(
         tangents, areas = measures.fabric, measures.areas
         of_edges = spread(tissue.n_edges, places[0], values.tension, np.nan)
         curved = _curved(tissue, of_edges, surface, measures)
-    weights, included = stress_weights(tissue, *places, tangents, areas)
+    operators = stress_operators(tissue, tangents, areas)
+    # The mean is that of the cells with a pressure and tensions of all their edges.
+    missing = ~spread(tissue.n_edges, places[0], True, False)
+    included = spread(tissue.n_cells + 1, places[1], True, False)
+    included[geometry_of(tissue).edge_cells[missing]] = False
+    included = included[:-1]
+    columns = np.concatenate([places[0], tissue.n_edges + places[1]])
+    total = max(float(np.sum(areas[included])), 1e-300)
+    weights = np.stack([included @ operator for operator in operators])[:, columns] / total
     components = weights @ np.concatenate([values.tension, values.pressure])
     # Pressures are less their mean.
     n, lag = len(values.tension), weights @ values.lag
@@ -112,6 +120,8 @@ def assembled(
     of_cells = lambda of, fill: spread(tissue.n_cells, places[1], of, fill)
     tensions, pressures = of_edges(values.tension, np.nan), of_cells(values.pressure, np.nan)
     determined = of_edges(values.sure, False) & ~four_fold
+    certain = np.append(np.where(determined, tensions, np.nan), pressures)
+    stresses = np.stack([operator @ certain / areas for operator in operators], axis=1)
     return InferredTensions(
         tissue=tissue,
         tensions=tensions,
@@ -120,7 +130,7 @@ def assembled(
         pressures=pressures,
         pressure_deviations=of_cells(values.pressure_deviation, np.nan),
         pressures_determined=of_cells(values.beside, False),
-        stresses=_stresses(tissue, tensions, pressures, determined, tangents, areas),
+        stresses=stresses[:, [[0, 1], [1, 2]]],
         mean_stress=mean_stress(components, covariance, int(included.sum())),
         four_fold=four_fold,
         curved=curved,
@@ -150,7 +160,7 @@ def _curved(
     )
 
 
-def spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
+def spread(size: int, place: Int[np.ndarray, " some"], of: Any, fill: Any) -> np.ndarray:
     """An array with values at some places."""
     array = np.full(size, fill)
     array[place] = of
@@ -216,22 +226,3 @@ def moved_by_fit(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tiss
     if tissue.arcs is None:
         return moved
     return moved.with_angles(jnp.asarray(angles, dtype))
-
-
-def _stresses(
-    tissue: Tissue,
-    tensions: Float[np.ndarray, " edges"],
-    pressures: Float[np.ndarray, " cells"],
-    determined: Bool[np.ndarray, " edges"],
-    tangents: Float[np.ndarray, "edges 2 2"],
-    areas: Float[np.ndarray, " cells"],
-) -> Float[np.ndarray, "cells 2 2"]:
-    """Stress of each cell, ½ Σ γ ∫ t t dl / A - p I over its edges (Batchelor 1970,
-    doi:10.1017/S0022112070000745)."""
-    geometry = geometry_of(tissue)
-    certain = np.where(determined, tensions, np.nan)
-    pulled = 0.5 * certain[:, None, None] * tangents
-    total = np.zeros((tissue.n_cells + 1, 2, 2))
-    for side in geometry.edge_cells.T:
-        np.add.at(total, side, pulled)
-    return total[:-1] / areas[:, None, None] - pressures[:, None, None] * np.eye(2)
