@@ -13,8 +13,8 @@ from vertax.mesh import Tissue, angle_of_area, geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import Equations
 from vertax.tensions._curves import Fitted, Points, arc_distances
-from vertax.tensions._inferred import CurvedGeometry, InferredTensions
-from vertax.tensions._lift import SurfaceMeasures, measured
+from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._lift import curved_geometry
 from vertax.tensions._mean_stress import fabric, mean_stress, stress_operators
 from vertax.tensions._solve import HIDDEN, Balance
 
@@ -97,11 +97,12 @@ def assembled(
     """
     tangents, areas = fabric(tissue), geometry_of(tissue).areas
     curved = None
+    of_edges = lambda of, fill: spread(tissue.n_edges, places[0], of, fill)
+    of_cells = lambda of, fill: spread(tissue.n_cells, places[1], of, fill)
+    tensions, pressures = of_edges(values.tension, np.nan), of_cells(values.pressure, np.nan)
     if surface is not None:
-        measures = measured(tissue, surface)
-        tangents, areas = measures.fabric, measures.areas
-        of_edges = spread(tissue.n_edges, places[0], values.tension, np.nan)
-        curved = _curved(tissue, of_edges, surface, measures)
+        curved, tangents = curved_geometry(tissue, surface, tensions)
+        areas = curved.areas
     operators = stress_operators(tissue, tangents, areas)
     # The mean is that of the cells with a pressure and tensions of all their edges.
     missing = ~spread(tissue.n_edges, places[0], True, False)
@@ -116,9 +117,6 @@ def assembled(
     n, lag = len(values.tension), weights @ values.lag
     weights[:, n:] -= weights[:, n:].mean(axis=1, keepdims=True)
     covariance = weights @ covariances(weights.T) + np.outer(lag, lag)
-    of_edges = lambda of, fill: spread(tissue.n_edges, places[0], of, fill)
-    of_cells = lambda of, fill: spread(tissue.n_cells, places[1], of, fill)
-    tensions, pressures = of_edges(values.tension, np.nan), of_cells(values.pressure, np.nan)
     determined = of_edges(values.sure, False) & ~four_fold
     certain = np.append(np.where(determined, tensions, np.nan), pressures)
     stresses = np.stack([operator @ certain / areas for operator in operators], axis=1)
@@ -135,28 +133,6 @@ def assembled(
         four_fold=four_fold,
         curved=curved,
         **fields,
-    )
-
-
-def _curved(
-    tissue: Tissue,
-    tensions: Float[np.ndarray, " edges"],
-    surface: AbstractSurface,
-    measures: SurfaceMeasures,
-) -> CurvedGeometry:
-    """The geometry on a surface, and the normal loads of tensions."""
-    m = tissue.topology
-    half = 0.5 * tensions * measures.bending
-    perimeters = np.zeros(tissue.n_cells + 1)
-    for side in np.asarray(m.edge_cells).T:
-        np.add.at(perimeters, side, measures.lengths)
-    return CurvedGeometry(
-        tissue=Tissue(tissue.vertices, m, tissue.boundary, tissue.softening, surface=surface),
-        areas=measures.areas,
-        perimeters=perimeters[:-1],
-        slopes=measures.slopes,
-        lengths=measures.lengths,
-        normal_loads=half[np.asarray(m.edge).reshape(-1, 3)].sum(axis=1),
     )
 
 
