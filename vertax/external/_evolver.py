@@ -116,7 +116,7 @@ class SurfaceEvolver(AbstractSimulator):
             lengths = np.hypot(*Edges.of(current).vectors(relaxed.vertices).T)
             edge = int(np.argmin(np.where(allowed, lengths, np.inf)))
             if not (allowed[edge] and lengths[edge] < self.t1):
-                return relaxed._replace(tissue=current, num_t1=number)
+                return relaxed._replace(topology=current.topology, num_t1=number)
             if number >= _MAX_T1_PER_EDGE * tissue.n_edges:
                 raise SimulatorError(
                     f"T1 transitions by Surface Evolver did not end after {number}. Lower `t1`, or pass "

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, PyTree, Shaped
 
 from vertax.energies import AbstractEnergy
-from vertax.mesh import Periodic, Tissue
+from vertax.mesh import Periodic, Tissue, Topology
 
 
 class SimulatorError(RuntimeError):
@@ -27,9 +27,8 @@ class Relaxed(NamedTuple):
 
     vertices: Float[np.ndarray, "vertices 2"]
     """Positions of the vertices; in periodic tissues in the same images of the box as in the input."""
-    tissue: Tissue | None = None
-    """The tissue with its new topology if the topology changed; the field `vertices` above overrides its
-    vertices. Shapes of arrays and indices of cells and edges must be those of the input."""
+    topology: Topology | None = None
+    """The new topology if it changed, with the shapes and the indices of cells and edges of the input."""
     angles: Float[np.ndarray, " edges"] | None = None
     """The angles of arcs, for tissues with arcs."""
     energy: float = float("nan")
