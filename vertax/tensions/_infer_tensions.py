@@ -162,27 +162,25 @@ def infer_tensions(
         source = _across_lines(source, line_width)
     if isinstance(height, str | os.PathLike):
         height = read_pixels(Path(height), "height", read_image)
-    if isinstance(source, Segmentation):
-        surface = source.tissue.surface
-        if height is not None:
-            surface = surface_of(source, height, plane_distance, unknown_height, sized=sized)
-        course = _of_mask(source, noise)
-    elif height is not None and not isinstance(height, AbstractSurface):
+    if isinstance(source, Segmentation) and height is not None:
+        height = surface_of(source, height, plane_distance, unknown_height, sized=sized)
+    if height is not None and not isinstance(height, AbstractSurface):
         raise TypeError(
             "Argument `height` must be a surface for a source without pixels, such as a "
             f"vertax.surfaces.HeightMap, but is {describe(height)}."
         )
+    if isinstance(source, Segmentation):
+        surface, course = source.tissue.surface, _of_mask(source, noise)
     elif isinstance(source, Foam):
-        surface = source.surface if height is None else height
-        course = _of_foam(source, noise)
+        surface, course = source.surface, _of_foam(source, noise)
     elif isinstance(source, Tissue):
-        surface = source.surface if height is None else height
-        course = _of_tissue(source.with_surface(None), noise)
+        surface, course = source.surface, _of_tissue(source.with_surface(None), noise)
     else:
         raise TypeError(
             "Argument `mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
             f"is {describe(mask)}. For several masks use vx.tensions.infer_tensions_of_masks."
         )
+    surface = surface if height is None else height
     tissue, report = course.tissue, course.report
     if edges == "arcs" and not tissue.inner_arcs:
         raise ValueError(

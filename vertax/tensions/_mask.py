@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
@@ -287,9 +287,9 @@ def _between(lines: Bool[np.ndarray, "rows columns"]) -> _Outlined | int:
     if len(cells) < 2:
         return len(cells)
     line = ~np.isin(regions, cells)
-    distance = np.asarray(distance_transform_edt(line))
-    nearest = distance_transform_edt(line, return_distances=False, return_indices=True)
-    regions = regions[tuple(np.asarray(nearest))]
+    transform: Any = distance_transform_edt(line, return_indices=True)
+    distance, nearest = transform
+    regions = regions[tuple(nearest)]
     half_width = _half_width(regions, distance)
     # What is farther from all cells than any point of a line, junctions included, is no line.
     regions[distance > 2 * half_width + 1] = 0
