@@ -24,7 +24,7 @@ LINES = {
     "jobs": 935,
     "mechanics": 2251,
     "mesh": 2933,
-    "plotting": 2150,
+    "plotting": 2135,
     "precondition": 716,
     "relax": 2134,
     "runs": 1996,
