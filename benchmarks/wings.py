@@ -16,8 +16,7 @@ import numpy as np
 
 import vertax as vx
 from vertax.tensions import infer_tensions
-from vertax.tensions._curves import Points
-from vertax.tensions._edges import fit, solution
+from vertax.tensions._edges import solution, vertices_only
 from vertax.tensions._observed_geometry import observed_geometry
 from vertax.tensions._outcome import relative
 
@@ -28,16 +27,16 @@ def halves(tissue: vx.Tissue, random: np.random.Generator) -> np.ndarray:
     """Standard scores of the differences of tensions inferred from two halves of the junctions."""
     geometry = observed_geometry(tissue)
     first = random.random(geometry.n_vertices) < 0.5
-    points = Points(np.zeros(0, int), np.zeros((0, 2)))
     parts = []
     for half in (first, ~first):
         part = geometry._replace(inner=geometry.inner & half)
-        curves = fit(part, points, 0.01 * part.size, apart=None, noise=None)
+        curves = vertices_only(part, 0.01 * part.size)
         uncertain = np.zeros(tissue.n_edges, bool)
-        solved = solution(part, curves, uncertain, straight=True, known_noise=False, prior=None)
-        result = relative(solved.balance, solved.system.which, curves)
+        options = {"straight": True, "known_noise": False, "prior": None}
+        system, balance = solution(part, curves, uncertain, **options)
+        result = relative(balance, system.which, curves)
         values = np.full((2, tissue.n_edges), np.nan)
-        values[:, solved.system.which.edges] = result.tension, result.tension_deviation
+        values[:, system.which.edges] = result.tension, result.tension_deviation
         parts.append(values)
     (a, b), (c, d) = parts
     scores = (a - c) / np.hypot(b, d)

@@ -197,7 +197,7 @@ def test_topology_is_kept_unless_transitions_are_allowed(problem):
 
 def test_invalid_arguments_are_rejected(problem, without_type_checks):
     wrong: Any = 3.7
-    with pytest.raises(TypeError, match=r"`problem` must be a vertax\.InverseProblem"):
+    with pytest.raises(TypeError, match=r"`problem` must be a vertax\.fitting\.InverseProblem"):
         bayes.LogPosterior(wrong, PRIOR, 0.01)
     with pytest.raises(TypeError, match="`prior` must hold distributions by name"):
         bayes.LogPosterior(problem, wrong, 0.01)

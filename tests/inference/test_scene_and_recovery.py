@@ -46,7 +46,7 @@ def test_the_guess_may_be_the_mean_and_relax_from_the_first_tissue():
 
 
 def test_unknown_choices_are_refused():
-    with pytest.raises(ValueError, match="`guess` must be 'redrawn' or 'mean'"):
+    with pytest.raises(ValueError, match="`guess` must be one of 'redrawn', 'mean'"):
         shape_factor_scene(8, key=jax.random.key(0), guess="median")
 
 

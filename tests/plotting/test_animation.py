@@ -127,7 +127,7 @@ def test_no_cell_jumps_across_a_periodic_box():
         ({"cells": np.zeros((4, 7))}, r"`cells` must give .* shape \(4, 8\), but gives \(4, 7\)"),
         ({"captions": ["a"]}, "`captions` must have one text for each of the 4 frames, but has 1"),
         ({"fps": 0.0}, "`fps` must be positive"),
-        ({"mark_t1": -1}, "`mark_t1` must not be negative"),
+        ({"mark_t1": -1}, "`mark_t1` must be at least 0"),
     ],
 )
 def test_invalid_arguments_raise(way, tmp_path, monkeypatch, changes, message):
@@ -165,7 +165,7 @@ def test_figures_become_an_animation_with_white_margins(tmp_path):
     [
         ({"fps": 0}, "`fps` must be positive"),
         ({"dpi": -1}, "`dpi` must be positive"),
-        ({"last_frame_seconds": -1}, "`last_frame_seconds` must not be negative"),
+        ({"last_frame_seconds": -1}, "`last_frame_seconds` must be at least 0"),
         ({"figures": []}, "`figures` must have at least one figure"),
         ({"path": "a.png"}, "`path` must end in .gif or .mp4"),
     ],

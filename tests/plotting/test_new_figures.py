@@ -3,6 +3,7 @@
 import matplotlib
 import numpy as np
 import pytest
+from helpers import random_tissue
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
@@ -50,11 +51,7 @@ class TestFigure:
         assert dict(matplotlib.rcParams) == before
 
     def test_a_figure_is_filled_once(self):
-        import jax
-
-        from vertax.initialise import periodic_voronoi
-
-        tissue, figure = periodic_voronoi(4, key=jax.random.key(0)), Figure()
+        tissue, figure = random_tissue(4, 0), Figure()
         assert plot_tissue(tissue, tissue.areas, figure=figure).figure is figure
         with pytest.raises(ValueError, match="`figure` must be empty"):
             plot_tissue(tissue, figure=figure)

@@ -270,7 +270,7 @@ def test_what_cannot_be_used_is_refused(foam):
         read_mask(np.eye(9, dtype=bool)[:, ::-1] & False | (np.arange(81).reshape(9, 9) == 3))
     with pytest.raises(ValueError, match="inner_arcs=True"):
         infer_tensions(cluster(6, 0), edges="arcs")
-    with pytest.raises(ValueError, match="'arcs', 'straight' or None"):
+    with pytest.raises(ValueError, match="'arcs', 'straight', None"):
         infer_tensions(tissue, edges="bent")
     mask = label_image(tissue, 200)
     mirrored = vx.initialise.from_labels(np.maximum(mask, 1), inner_arcs=True)

@@ -161,7 +161,7 @@ def test_wrong_options_and_empty_sources_raise(mask, tmp_path):
 def test_masks_of_another_kind_raise(without_type_checks):
     with pytest.raises(TypeError, match=r"`masks` must be a folder, .* but is None"):
         find_masks(None)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match='`format` must be "csv" or "parquet"'):
+    with pytest.raises(ValueError, match="`format` must be one of 'csv', 'parquet'"):
         vx.tensions.TensionsOfMasks({}, {}).write("x", format="xlsx")  # pyright: ignore[reportArgumentType]
 
 

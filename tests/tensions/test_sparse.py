@@ -14,8 +14,8 @@ from vertax.initialise import from_labels
 from vertax.io import read_surface_evolver
 from vertax.tensions import _infer_tensions, infer_tensions
 from vertax.tensions._balance import equations, force_slopes, forces
-from vertax.tensions._curves import Points
-from vertax.tensions._edges import fit, solution
+from vertax.tensions._curves import Points, read_courses
+from vertax.tensions._edges import solution
 from vertax.tensions._infer_tensions import _of_foam, _of_mask
 from vertax.tensions._observed_geometry import observed_geometry
 from vertax.tensions._solve import HIDDEN, System, solve
@@ -68,12 +68,11 @@ def system_of(course, straight, prior=None):
     geometry = observed_geometry(course.tissue, course.labels == 0)
     used = np.isin(course.points.edge, equations(geometry).edges)
     points = Points(*(of[used] for of in course.points))
-    curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
+    curves = read_courses(geometry, points, course.grain, apart=course.apart, noise=course.noise)
     uncertain = np.zeros(course.tissue.n_edges, bool)
-    solved = solution(
-        geometry, curves, uncertain, straight=straight, known_noise=False, prior=prior
-    )
-    return solved.system, solved.balance.errors
+    options = {"straight": straight, "known_noise": False, "prior": prior}
+    system, balance = solution(geometry, curves, uncertain, **options)
+    return system, balance.errors
 
 
 @needs_data

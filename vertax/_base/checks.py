@@ -116,7 +116,7 @@ def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
     """Raise a `ValueError` unless a value is one of the choices."""
     if not any(isinstance(value, type(choice)) and value == choice for choice in choices):
         listed = ", ".join(map(repr, choices))
-        raise ValueError(f"Argument `{name}` must be one of {listed}, but is {value!r}.")
+        raise ValueError(f"Argument `{name}` must be one of {listed}, but is {describe(value)}.")
 
 
 def check_shape(name: str, value: Any, *shapes: tuple[int, ...], remedy: str = "") -> None:
@@ -170,23 +170,16 @@ def as_key(key: PRNGKeyArray | int) -> PRNGKeyArray:
                 f"Argument `key` must be a seed of at most {_SEED_BITS} bits (with sign), but is {seed}."
             )
         return jax.random.key(seed)
-    if not isinstance(key, jax.Array | np.ndarray):
-        raise TypeError(
-            "Argument `key` must be a key from jax.random.key(seed) or a seed, but is "
-            f"{describe(key)}."
-        )
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    if typed and key.shape == ():
-        return key
-    if not typed and key.dtype == np.uint32 and key.shape == (2,):
-        return jnp.asarray(key)
-    if not typed and key.dtype != np.uint32:
-        raise TypeError(
-            "Argument `key` must be a key from jax.random.key(seed) or a seed, but is an array of type "
-            f"{key.dtype}."
-        )
-    raise ValueError(
-        f"Argument `key` must be one key, but has shape {key.shape}. Take one of them, key[0]."
+    if isinstance(key, jax.Array | np.ndarray):
+        typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+        if key.shape == () if typed else (key.dtype == np.uint32 and key.shape == (2,)):
+            return key if typed else jnp.asarray(key)
+        if typed or key.dtype == np.uint32:
+            raise ValueError(
+                f"Argument `key` must be one key, but has shape {key.shape}. Take one of them, key[0]."
+            )
+    raise TypeError(
+        f"Argument `key` must be a key from jax.random.key(seed) or a seed, but is {describe(key)}."
     )
 
 
@@ -286,10 +279,10 @@ def describe(value: Any) -> str:
     """Describe a value of the wrong type in an error message."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
-    if hasattr(value, "shape") and np.shape(value) != ():
-        return f"an array of shape {np.shape(value)} and type {value.dtype}"
     if isinstance(value, str | bytes | numbers.Number | np.generic) or value is None:
         return repr(value)
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"an array of shape {np.shape(value)} and type {value.dtype}"
     return f"an object of type {type(value).__name__}"
 
 

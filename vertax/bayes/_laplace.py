@@ -14,12 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import as_key
-from vertax.bayes._log_posterior import (
-    LogPosterior,
-    Outcome,
-    Parameters,
-    check_log_posterior,
-)
+from vertax.bayes._log_posterior import LogPosterior, Outcome, Parameters, check_instance
 
 
 class Laplace(eqx.Module):
@@ -57,7 +52,7 @@ class Laplace(eqx.Module):
     """Evaluations of the gradient."""
 
     def __init__(self, log_posterior: LogPosterior, start: Parameters | None = None):
-        check_log_posterior(log_posterior)
+        check_instance("log_posterior", log_posterior, LogPosterior)
         z = log_posterior.start() if start is None else log_posterior.coordinates_of(start)
         first = evaluate(log_posterior, z)
         if not np.isfinite(first.log_density):

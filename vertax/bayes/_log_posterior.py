@@ -104,10 +104,7 @@ class LogPosterior(eqx.Module):
         energy: Callable[[Parameters], Any] | None = None,
         across_t1: bool = False,
     ):
-        if not isinstance(problem, InverseProblem):
-            raise TypeError(
-                f"Argument `problem` must be a vertax.InverseProblem, but is {describe(problem)}."
-            )
+        check_instance("problem", problem, InverseProblem)
         if not isinstance(prior, Mapping) or not prior:
             raise TypeError(
                 "Argument `prior` must hold distributions by name, e.g. "
@@ -324,12 +321,11 @@ def _expanded(
     return expanded
 
 
-def check_log_posterior(value: Any) -> None:
-    """Raise a `TypeError` for a value that is no `LogPosterior`."""
-    if not isinstance(value, LogPosterior):
-        raise TypeError(
-            f"Argument `log_posterior` must be a vertax.bayes.LogPosterior, but is {describe(value)}."
-        )
+def check_instance(name: str, value: Any, kind: type) -> None:
+    """Raise a `TypeError` for a value of another class of vertax."""
+    if not isinstance(value, kind):
+        full_name = f"{kind.__module__.partition('._')[0]}.{kind.__name__}"
+        raise TypeError(f"Argument `{name}` must be a {full_name}, but is {describe(value)}.")
 
 
 def _check_proper(name: str, distribution: Any) -> None:

@@ -17,7 +17,7 @@ from vertax.energies import AbstractEnergy
 from vertax.external._evolver_datafile import datafile, spacing_commands
 from vertax.external._evolver_model import Terms, parameter_derivatives
 from vertax.external._evolver_strings import Strings
-from vertax.external._evolver_t1 import can_flip, flip_by_program, shortest_edge
+from vertax.external._evolver_t1 import can_flip, flip_by_program
 from vertax.external._program import run_program, tail
 from vertax.external._simulator import AbstractSimulator, Edges, Relaxed, SimulatorError
 from vertax.mesh import Tissue
@@ -114,15 +114,15 @@ class SurfaceEvolver(AbstractSimulator):
             allowed = can_flip(current.topology)
             allowed[list(rejected)] = False
             lengths = np.hypot(*Edges.of(current).vectors(relaxed.vertices).T)
-            edge = shortest_edge(lengths, self.t1, allowed)
-            if edge is None:
-                return relaxed._replace(tissue=current, num_t1=number)
+            edge = int(np.argmin(np.where(allowed, lengths, np.inf)))
+            if not (allowed[edge] and lengths[edge] < self.t1):
+                return relaxed._replace(topology=current.topology, num_t1=number)
             if number >= _MAX_T1_PER_EDGE * tissue.n_edges:
                 raise SimulatorError(
                     f"T1 transitions by Surface Evolver did not end after {number}. Lower `t1`, or pass "
                     "`t1=None`."
                 )
-            flipped = flip_by_program(current, edge, 0.5 * self.t1, self._run_commands)
+            flipped = flip_by_program(current, edge, 0.5 * self.t1, self._run)
             trial = None
             if flipped is not None:
                 with suppress(SimulatorError):  # the relaxation after the flip did not converge
@@ -148,11 +148,8 @@ class SurfaceEvolver(AbstractSimulator):
         if self.areas == "fixed":
             terms, fixed_cells = self._fixed(strings, elastic_terms)
         text = datafile(strings, terms, forces, torques, fixed_cells=fixed_cells)
-        points, pressures, numbers = self._run(
-            text,
-            self._commands(strings, near=forces is not None) + _report_commands(fixed_cells),
-            strings,
-        )
+        commands = self._commands(strings, near=forces is not None) + _report_commands(fixed_cells)
+        points, pressures, numbers = _parse_result(strings, *self._run(text, commands))
         measures = (strings.lengths(points), strings.areas(points), strings.perimeters(points))
         return Relaxed(
             points[: strings.n_vertices] + strings.images @ strings.lattice,
@@ -177,10 +174,9 @@ class SurfaceEvolver(AbstractSimulator):
         """
         strings = Strings.of(tissue, self.pieces)
         terms = Terms.of(energy, strings.pieces.n_cells, len(strings.parts))
-        text = datafile(strings, terms)
-        return self._run(text, "steps_done := 0;\nrecalc;\n" + _report_commands(), strings)[2][
-            "energy"
-        ]
+        commands = "steps_done := 0;\nrecalc;\n" + _report_commands()
+        result = self._run(datafile(strings, terms), commands)
+        return _parse_result(strings, *result)[2]["energy"]
 
     def _fixed(self, strings: Strings, terms: Terms) -> tuple[Terms, Sequence[int]]:
         """The terms without area elasticity, and the cells with a fixed area."""
@@ -195,22 +191,14 @@ class SurfaceEvolver(AbstractSimulator):
             targets, fixed_cells = targets * _target_scale(strings, terms), range(n - 1)
         return terms._replace(area_stiffness=np.zeros(n), area=targets), fixed_cells
 
-    def _run_commands(self, text: str, commands: str) -> str:
-        """Run the program with a datafile and commands; return the text of its result."""
-        command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
-        files = {"tissue.fe": text, "relax.cmd": commands}
-        results, _ = run_program(command, files, ["result"], timeout=self.timeout, install=INSTALL)
-        return results["result"]
-
-    def _run(
-        self, text: str, commands: str, strings: Strings
-    ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    def _run(self, text: str, commands: str) -> tuple[str, str]:
+        """Run the program with a datafile and commands; return the text of its result, and its log."""
         command = [self.command, "-i", "-frelax.cmd", "tissue.fe"]
         files = {"tissue.fe": text, "relax.cmd": commands}
         results, log = run_program(
             command, files, ["result"], timeout=self.timeout, install=INSTALL
         )
-        return _parse_result(results["result"], strings, log)
+        return results["result"], log
 
     def _commands(self, strings: Strings, *, near: bool) -> str:
         """The commands of a relaxation: conjugate gradients, then Newton's method with a line search.
@@ -285,7 +273,7 @@ def _report_commands(fixed_cells: Sequence[int] = ()) -> str:
 
 
 def _parse_result(
-    text: str, strings: Strings, log: str
+    strings: Strings, text: str, log: str
 ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Points, pressures (of fixed areas) and numbers from the output of the program."""
     points = np.full_like(strings.points, np.nan)

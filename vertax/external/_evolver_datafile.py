@@ -33,9 +33,8 @@ def datafile(
 
     The areas of `fixed_cells` are constrained to their targets.
     """
-    lines = ["STRING", "SPACE_DIMENSION 2", "KEEP_ORIGINALS"]
-    if strings.periodic:
-        lines += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in strings.lattice)]
+    head, point_lines, piece_lines = strings.lines()
+    lines = [*head, "KEEP_ORIGINALS"]
     lines += [f"define vertex attribute {name} real" for name in _POINT_ATTRIBUTES]
     lines += [f"define edge attribute {name} real" for name in _PIECE_ATTRIBUTES]
     edges = "method edge_general_integral scalar_integrand:"
@@ -51,15 +50,11 @@ def datafile(
     _perimeters(lines, quantities, strings, terms)
     pulls, arms = strings.point_forces(forces, torques), np.zeros_like(strings.points)
     springs = _springs(lines, strings, terms, arms)
-    pinned = set(strings.fixed.tolist())
     lines.append("vertices")
     rows = np.concatenate([pulls, arms], axis=1)
-    for i, ((x, y), row) in enumerate(zip(strings.points, rows, strict=True)):
-        fix = " fixed" if i in pinned else ""
+    for i, (line, row) in enumerate(zip(point_lines, rows, strict=True)):
         names = " ".join(springs) if i < strings.n_vertices else ""
-        lines.append(
-            f"{i + 1} {x:.17g} {y:.17g}{fix} {_attributes(_POINT_ATTRIBUTES, row)} nudge {names}"
-        )
+        lines.append(f"{line} {_attributes(_POINT_ATTRIBUTES, row)} nudge {names}")
     lines.append("edges")
     parts = strings.parts[strings.edge]
     spring = parts * _stiffness(strings, terms)
@@ -69,13 +64,9 @@ def datafile(
     rows = np.stack(
         [terms.tension[strings.edge], soft, spring, rest, first, np.zeros(len(parts))], axis=1
     )
-    sign = {0: "*", 1: "+", -1: "-"}
-    for i, ((a, b), wrap) in enumerate(zip(strings.pieces.ends, strings.wraps, strict=True)):
-        wrap_text = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
-        names = " ".join(quantities[i])
-        lines.append(
-            f"{i + 1} {a + 1} {b + 1}{wrap_text} density 0 {_attributes(_PIECE_ATTRIBUTES, rows[i])} {names}"
-        )
+    for line, row, names in zip(piece_lines, rows, quantities, strict=True):
+        attributes = _attributes(_PIECE_ATTRIBUTES, row)
+        lines.append(f"{line} density 0 {attributes} {' '.join(names)}")
     return "\n".join([*lines, "read", ""])
 
 

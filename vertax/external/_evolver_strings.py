@@ -117,6 +117,20 @@ class Strings(NamedTuple):
             angles = angles - (_segment_area(angles) - enclosed) / _segment_area_derivative(angles)
         return angles
 
+    def lines(self) -> tuple[list[str], list[str], list[str]]:
+        """Lines of a datafile: its head, the points and the strings."""
+        head = ["STRING", "SPACE_DIMENSION 2"]
+        if self.periodic:
+            head += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in self.lattice)]
+        points = [f"{i} {x:.17g} {y:.17g}" for i, (x, y) in enumerate(self.points, 1)]
+        for i in self.fixed:
+            points[i] += " fixed"
+        strings = [f"{i} {a + 1} {b + 1}" for i, (a, b) in enumerate(self.pieces.ends, 1)]
+        if self.periodic:
+            sign = np.array(["*", "+", "-"])[self.wraps]
+            strings = [f"{line} {x} {y}" for line, (x, y) in zip(strings, sign, strict=True)]
+        return head, points, strings
+
     def point_forces(
         self,
         forces: Float[np.ndarray, "vertices 2"] | None,

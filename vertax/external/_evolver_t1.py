@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from vertax.external._evolver_strings import Strings
-from vertax.external._simulator import Edges, SimulatorError
+from vertax.external._simulator import Edges, SimulatorError, clockwise
 from vertax.mesh import Tissue, Topology
 
 
 def flip_by_program(
-    tissue: Tissue, edge: int, length: float, run: Callable[[str, str], str]
+    tissue: Tissue, edge: int, length: float, run: Callable[[str, str], tuple[str, str]]
 ) -> Tissue | None:
     """A tissue with an edge flipped by the program's `t1_edgeswap`; None if it rejects the flip.
 
@@ -23,7 +23,7 @@ def flip_by_program(
     - `tissue`: the tissue, in NumPy arrays.
     - `edge`: the index of the edge.
     - `length`: minimum length of the flipped edge.
-    - `run`: a function of a datafile and commands that returns the output of the program.
+    - `run`: a function of a datafile and commands that returns the result of the program and its log.
     """
     commands = [
         f"t1_edgeswap edge[{edge + 1}];",
@@ -33,7 +33,7 @@ def flip_by_program(
         "quit",
         "",
     ]
-    rows = [line.split() for line in run(_mesh(tissue), "\n".join(commands)).splitlines()]
+    rows = [line.split() for line in run(_mesh(tissue), "\n".join(commands))[0].splitlines()]
     if rows[-1:] != [["end"]]:
         raise SimulatorError("The output of evolver after a T1 transition is incomplete.")
     reported = np.array(rows[:-1], int)
@@ -75,7 +75,7 @@ def can_flip(topology: Topology) -> Bool[np.ndarray, " edges"]:
     cell = np.asarray(topology.cell)
     # The cells on the left, on the right, and at both ends.
     left, right = cell[h], cell[t]
-    first, last = cell[_counter_clockwise(h)], cell[_counter_clockwise(t)]
+    first, last = cell[counter_clockwise(h)], cell[counter_clockwise(t)]
     sides = np.bincount(cell, minlength=topology.n_cells + 2)
     inner = np.max([left, right, first, last], axis=0) < topology.n_cells
     # (After the flip the cells at the ends are on both sides of the edge, so they must differ.)
@@ -116,38 +116,21 @@ def flip_edge(topology: Topology, edge: int) -> Topology:
 def _edge_neighbourhood(topology: Topology, h: Int[np.ndarray, " edges"]) -> tuple[np.ndarray, ...]:
     """Half-edges, their twins, and the four other half-edges at their ends, counter-clockwise."""
     t = np.asarray(topology.twin)[h]
-    return h, t, _counter_clockwise(h), _clockwise(h), _counter_clockwise(t), _clockwise(t)
+    return h, t, counter_clockwise(h), clockwise(h), counter_clockwise(t), clockwise(t)
 
 
-def _clockwise(h: Int[np.ndarray, " edges"]) -> Int[np.ndarray, " edges"]:
-    return np.where(h % 3 == 0, h + 2, h - 1)
-
-
-def _counter_clockwise(h: Int[np.ndarray, " edges"]) -> Int[np.ndarray, " edges"]:
+def counter_clockwise(h: Int[np.ndarray, " edges"]) -> Int[np.ndarray, " edges"]:
     return np.where(h % 3 == 2, h - 2, h + 1)
 
 
 def _mesh(tissue: Tissue) -> str:
     """Vertices, edges and faces of a tissue as a datafile, for the program's T1 transitions."""
-    strings, topology = Strings.of(tissue), tissue.topology
-    lines = ["STRING", "SPACE_DIMENSION 2"]
-    if strings.periodic:
-        lines += ["TORUS", "PERIODS", *(f"{a:.17g} {b:.17g}" for a, b in strings.lattice)]
-    fixed = set(strings.fixed.tolist())
-    lines.append("vertices")
-    lines += [
-        f"{i + 1} {x:.17g} {y:.17g}{' fixed' if i in fixed else ''}"
-        for i, (x, y) in enumerate(strings.points)
-    ]
-    lines.append("edges")
-    sign = {0: "*", 1: "+", -1: "-"}
-    for i, ((a, b), wrap) in enumerate(zip(strings.pieces.ends, strings.wraps, strict=True)):
-        wrap_text = " " + " ".join(sign[int(w)] for w in wrap) if strings.periodic else ""
-        lines.append(f"{i + 1} {a + 1} {b + 1}{wrap_text}")
-    lines.append("faces")
+    topology = tissue.topology
+    head, points, strings = Strings.of(tissue).lines()
+    lines = [*head, "vertices", *points, "edges", *strings, "faces"]
     twin, cell, number = (np.asarray(x) for x in (topology.twin, topology.cell, topology.edge))
     direction = np.where(np.asarray(topology.half_edge)[number] == np.arange(len(twin)), 1, -1)
-    following = _clockwise(twin)
+    following = clockwise(twin)
     for face in range(topology.n_cells):
         first = int(np.flatnonzero(cell == face)[0])
         loop, h = [], first
@@ -156,12 +139,3 @@ def _mesh(tissue: Tissue) -> str:
             h = int(following[h])
         lines.append(f"{face + 1} {' '.join(loop)}")
     return "\n".join([*lines, "read", ""])
-
-
-def shortest_edge(
-    lengths: Float[np.ndarray, " edges"], below: float, allowed: Bool[np.ndarray, " edges"]
-) -> int | None:
-    """The shortest allowed edge below a length; None if there is none."""
-    lengths = np.where(allowed, lengths, np.inf)
-    edge = int(np.argmin(lengths))
-    return edge if lengths[edge] < below else None

@@ -22,8 +22,8 @@ from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.energies import AbstractEnergy
 from vertax.energies._scales import scales_of
 from vertax.external._external_gradient import ExternalEquilibrium, attach_gradient, force_of
-from vertax.external._host import Job, Request, Result, run_jobs, stack_results
-from vertax.external._simulator import AbstractSimulator, Ledger, SimulatorError, ledger_of
+from vertax.external._host import Job, Request, run_jobs, stack_results
+from vertax.external._simulator import AbstractSimulator, Ledger, Relaxed, SimulatorError, ledger_of
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Equilibrium
 from vertax.relax._equilibrium import follow_start, free_motions
@@ -212,17 +212,17 @@ class External(AbstractResponse):
             return scales_of(tissue, energy)
         return Scales(tissue.cell_size, jnp.asarray(self.stiffness, tissue.vertices.dtype))
 
-    def run_simulator(self, request: Request, throw: bool) -> Result:
+    def run_simulator(self, request: Request, throw: bool) -> Relaxed:
         """Run the program for one request, inside a compiled function; batches run in parallel."""
         arrays, static = eqx.partition(request, eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
         tissue = request.tissue
-        number = jax.ShapeDtypeStruct((), tissue.vertices.dtype)
-        integer = jax.ShapeDtypeStruct((), jnp.int32)
+        number: Any = jax.ShapeDtypeStruct((), tissue.vertices.dtype)
+        integer: Any = jax.ShapeDtypeStruct((), jnp.int32)
         shapes = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
         slope = None if self.slope == "energy" else eqx.filter(request.energy, eqx.is_inexact_array)
         dynamic, fixed = eqx.partition(tissue.topology, eqx.is_array)
-        structures = Result(
+        structures = Relaxed(
             vertices=shapes(tissue.vertices),
             angles=shapes(tissue.angles),
             topology=shapes(dynamic),
@@ -235,7 +235,7 @@ class External(AbstractResponse):
         ranks = [x.ndim for x in leaves]
         workers = self.workers or os.cpu_count() or 1
 
-        def host(*arrays: Any) -> Result:
+        def host(*arrays: Any) -> Relaxed:
             host_arrays = [np.asarray(x) for x in arrays]
             batch = host_arrays[0].shape[: host_arrays[0].ndim - ranks[0]]
             n = int(np.prod(batch))

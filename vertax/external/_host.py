@@ -29,28 +29,15 @@ class Request(NamedTuple):
     """Torques on the angles of arcs, or None."""
 
 
-class Result(NamedTuple):
-    """The result of a simulator, in arrays; missing values are NaN."""
-
-    vertices: Any
-    angles: Any
-    topology: Any
-    energy: Any
-    max_force: Any
-    num_steps: Any
-    num_t1: Any
-    slope: Any
-
-
 class Job(NamedTuple):
-    """One run of a simulator, as a picklable function."""
+    """One run of a simulator, as a picklable function; its result is in arrays."""
 
     simulator: AbstractSimulator
     request: Request
     slope: str
     step: float
 
-    def __call__(self) -> Result:
+    def __call__(self) -> Relaxed:
         tissue, energy, forces, torques = self.request
         needs_torques = torques is not None and np.any(torques != 0)
         if needs_torques and not self.simulator.bends:
@@ -67,11 +54,9 @@ class Job(NamedTuple):
             if angles is None:
                 raise SimulatorError("The program returned `angles`, but the tissue has no arcs.")
             angles = _array("angles", relaxed.angles, np.shape(angles))
-        topology = tissue.topology
-        if relaxed.tissue is not None:
-            topology = relaxed.tissue.topology
-            if _shapes(topology) != _shapes(tissue.topology):
-                raise SimulatorError("The program returned a tissue of another size.")
+        topology = relaxed.topology or tissue.topology
+        if _shapes(topology) != _shapes(tissue.topology):
+            raise SimulatorError("The program returned a topology of another size.")
         changed = np.any(np.asarray(topology.twin) != tissue.topology.twin)
         if forces is not None and changed:
             raise SimulatorError("The program changed the topology of a tissue that was nudged.")
@@ -79,15 +64,15 @@ class Job(NamedTuple):
         if self.slope != "energy":
             relaxed_tissue = _with_result(tissue, topology, vertices, angles)
             slope = _slope(self, relaxed, relaxed_tissue, energy)
-        return Result(
-            vertices,
-            angles,
-            topology,
-            np.asarray(relaxed.energy, vertices.dtype),
-            np.asarray(relaxed.max_force, vertices.dtype),
-            np.asarray(relaxed.num_steps, np.int32),
-            np.asarray(relaxed.num_t1, np.int32),
-            slope,
+        return relaxed._replace(
+            vertices=vertices,
+            topology=topology,
+            angles=angles,
+            energy=np.asarray(relaxed.energy, vertices.dtype),
+            max_force=np.asarray(relaxed.max_force, vertices.dtype),
+            num_steps=np.asarray(relaxed.num_steps, np.int32),
+            num_t1=np.asarray(relaxed.num_t1, np.int32),
+            slope=slope,
         )
 
 
@@ -97,15 +82,15 @@ def run_jobs(
     processes: bool,
     throw: bool,
     timeout: float | None = None,
-) -> tuple[list[Result | None], SimulatorError | None]:
+) -> tuple[list[Relaxed | None], SimulatorError | None]:
     """Run jobs in parallel; return their results (None for failed ones) and the first error, if any.
 
     With `processes` each job is killed after `timeout` seconds.
     """
-    results: list[Result | None] = [None] * len(requests)
+    results: list[Relaxed | None] = [None] * len(requests)
     reasons: list[SimulatorError] = []
 
-    def one(number: int) -> Result:
+    def one(number: int) -> Relaxed:
         job = requests[number]
         with ledger_of(job.simulator).run():
             return _in_process(job, timeout) if processes else job()
@@ -122,16 +107,16 @@ def run_jobs(
 
 
 def stack_results(
-    results: list[Result | None],
+    results: list[Relaxed | None],
     requests: list[Request],
-    structures: Result,
+    structures: Relaxed,
     batch: tuple[int, ...],
-) -> Result:
+) -> Relaxed:
     """The results of a batch as arrays of the shapes that JAX expects; NaN for failed runs."""
     structure = jax.tree.structure(structures)
     like = jax.tree.leaves(structures)
 
-    def leaves(result: Result | None, request: Request) -> list[Any]:
+    def leaves(result: Relaxed | None, request: Request) -> list[Any]:
         if result is None:
             fill = [np.full(x.shape, np.nan if x.dtype.kind == "f" else 0, x.dtype) for x in like]
             empty = jax.tree.unflatten(structure, fill)
@@ -149,13 +134,13 @@ def stack_results(
     return jax.tree.unflatten(structure, columns)
 
 
-def _on_cpu(job: Job) -> Result:
+def _on_cpu(job: Job) -> Relaxed:
     """Run a job in another process, which leaves the accelerator to the main process."""
     jax.config.update("jax_platforms", "cpu")
     return job()
 
 
-def _in_process(job: Job, timeout: float | None) -> Result:
+def _in_process(job: Job, timeout: float | None) -> Relaxed:
     try:
         return run_in_process(partial(_on_cpu, job), timeout)
     except ProcessDied as error:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, PyTree, Shaped
 
 from vertax.energies import AbstractEnergy
-from vertax.mesh import Periodic, Tissue
+from vertax.mesh import Periodic, Tissue, Topology
 
 
 class SimulatorError(RuntimeError):
@@ -27,9 +27,8 @@ class Relaxed(NamedTuple):
 
     vertices: Float[np.ndarray, "vertices 2"]
     """Positions of the vertices; in periodic tissues in the same images of the box as in the input."""
-    tissue: Tissue | None = None
-    """The tissue with its new topology if the topology changed; the field `vertices` above overrides its
-    vertices. Shapes of arrays and indices of cells and edges must be those of the input."""
+    topology: Topology | None = None
+    """The new topology if it changed, with the shapes and the indices of cells and edges of the input."""
     angles: Float[np.ndarray, " edges"] | None = None
     """The angles of arcs, for tissues with arcs."""
     energy: float = float("nan")
@@ -115,6 +114,11 @@ class AbstractSimulator(abc.ABC):
         return f"{type(self).__name__}({settings})"
 
 
+def clockwise(h: Int[np.ndarray, " half_edges"]) -> Int[np.ndarray, " half_edges"]:
+    """The next half-edge at the same vertex, clockwise."""
+    return np.where(h % 3 == 0, h + 2, h - 1)
+
+
 class Edges(NamedTuple):
     """The edges of a tissue as NumPy arrays: all that an energy of lengths, areas and perimeters needs."""
 
@@ -140,7 +144,6 @@ class Edges(NamedTuple):
         """
         m = tissue.topology
         twin, cell, frame, h = (np.asarray(x) for x in (m.twin, m.cell, m.frame, m.half_edge))
-        clockwise = lambda h: np.where(h % 3 == 0, h + 2, h - 1)
         lattice = np.zeros((2, 2))
         if isinstance(tissue.boundary, Periodic):
             lattice = np.asarray(tissue.boundary.lattice, float)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.checks import check_number
+from vertax._base.checks import check_choice, check_number
 from vertax._base.pixels import pixel_length
 from vertax.costs import MeshImage, mirror
 from vertax.energies import AbstractEnergy, ShapeFactorEnergy
@@ -206,14 +206,8 @@ def micrograph_problem(
 
     - `ValueError` for an image that cannot be used, and for an unknown `border` or `rest_areas`.
     """
-    for name, value, options in (
-        ("border", border, ("mirrored", "pinned")),
-        ("rest_areas", rest_areas, ("fitted", "observed", "equal")),
-    ):
-        if value not in options:
-            raise ValueError(
-                f"Argument `{name}` must be one of {', '.join(map(repr, options))}, but is {value!r}."
-            )
+    check_choice("border", border, ("mirrored", "pinned"))
+    check_choice("rest_areas", rest_areas, ("fitted", "observed", "equal"))
     if pixel_size is not None:
         check_number("pixel_size", pixel_size, above=0)
     segmenter = Watershed() if segmenter is None else segmenter

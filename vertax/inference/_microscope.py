@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from vertax._base.checks import check_integer
 from vertax.costs import render
 from vertax.io import Foam
 from vertax.mesh import Drawing, Free, Periodic, Tissue
@@ -153,8 +154,7 @@ def label_image(tissue: Tissue | Foam, pixels: int) -> Int[np.ndarray, "rows col
             "Argument `tissue` must have a free boundary, but its boundary is "
             f"{type(drawn.boundary).__name__}."
         )
-    if pixels < 16:
-        raise ValueError(f"Argument `pixels` must be at least 16, but is {pixels}.")
+    check_integer("pixels", pixels, at_least=16)
     if foam is None:
         polygons, sizes = Drawing(drawn, 60).polygons()
         outlines = [polygon[:size] for polygon, size in zip(polygons, sizes, strict=True)]

@@ -156,7 +156,8 @@ class _Frame:
     """Places, areas and contacts of the cells of a frame, by number."""
 
     def __init__(self, numbers: Int[np.ndarray, " cells"], tissue: Tissue):
-        self.boundary = tissue.boundary
+        boundary = tissue.boundary
+        self.lattice = boundary.lattice if isinstance(boundary, Periodic) else None
         values = zip(
             numbers.tolist(), np.asarray(tissue.centroids), np.asarray(tissue.areas), strict=True
         )
@@ -173,16 +174,14 @@ class _Frame:
             self.neighbours.setdefault(a, set()).add(b)
             self.neighbours.setdefault(b, set()).add(a)
 
-    def displacement(self, places: np.ndarray, origins: np.ndarray) -> np.ndarray:
-        """Vectors from points to others, across a periodic boundary."""
-        away = places - origins
-        if isinstance(self.boundary, Periodic):
-            return np.asarray(self.boundary.shortest(jnp.asarray(away)))
-        return away
 
-    def distance(self, place: np.ndarray, other: np.ndarray) -> float:
-        """Distance of two points, across a periodic boundary."""
-        return float(np.linalg.norm(self.displacement(place, other)))
+def shortest(
+    away: Float[np.ndarray, "*n 2"], lattice: Float[np.ndarray | Array, "2 2"] | None
+) -> Float[np.ndarray, "*n 2"]:
+    """Vectors between points, the shortest across the boundary of a periodic tissue."""
+    if lattice is None:
+        return away
+    return np.asarray(Periodic(jnp.asarray(lattice)).shortest(jnp.asarray(away)))
 
 
 def _checked_numbers(frame: int, numbers: Any, tissue: Tissue) -> Int[np.ndarray, " cells"]:
@@ -209,7 +208,8 @@ def _check_jumps(frames: list[_Frame], largest: float) -> None:
         if cells:
             places = np.array([frame.places[cell] for cell in cells])
             origins = np.array([frames[last[cell]].places[cell] for cell in cells])
-            away = np.linalg.norm(frame.displacement(places, origins), axis=1) / frame.size
+            away = shortest(places - origins, frame.lattice)
+            away = np.linalg.norm(away, axis=1) / frame.size
             elapsed = now - np.array([last[cell] for cell in cells])
             if (jumps := np.flatnonzero(away > largest * elapsed)).size:
                 k = int(jumps[0])
@@ -272,12 +272,13 @@ def _divisions(
                 continue
             areas = np.array([after.areas[d] for d in daughters])
             places = np.stack([after.places[d] for d in daughters])
-            places = places[0] + after.displacement(places, places[0])
+            places = places[0] + shortest(places - places[0], after.lattice)
             middle = areas @ places / areas.sum()
             for mother in mothers:
                 # The daughters cover the mother: the same centroid within a third of its size.
                 change = abs(np.log(areas.sum() / before.areas[mother]))
-                away = after.distance(middle, before.places[mother]) / np.sqrt(before.areas[mother])
+                away = shortest(middle - before.places[mother], after.lattice)
+                away = float(np.linalg.norm(away)) / np.sqrt(before.areas[mother])
                 if change < 0.5 and away < 1 / 3 and (best is None or away < best[0]):
                     best = (away, mother, daughters)
         if best is not None:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from vertax.inference._movie import Repair
+from vertax.inference._movie import Repair, shortest
 from vertax.initialise._faces import Names
 from vertax.initialise._nearby_corners import areas_and_centroids, with_images
 from vertax.initialise._polygons import corner_images
-from vertax.mesh import Periodic
 
 # The place of another cell, in cell sizes: so far is a cell from it, and from its place before.
 _CLOSE = 0.5
@@ -94,7 +92,7 @@ def check_given(
         facts["area"] = wrong, areas, given["area"]
     if {"centroid_x", "centroid_y"} <= set(given):
         centroid = np.stack([given["centroid_x"], given["centroid_y"]], axis=1)
-        away = np.linalg.norm(_away(polygons.centroids, centroid, lattice), axis=1)
+        away = np.linalg.norm(shortest(polygons.centroids - centroid, lattice), axis=1)
         facts["centroid"] = away > 0.25 * np.sqrt(areas), polygons.centroids, centroid
     for what, (wrong, measured, other) in facts.items():
         if wrong.any():
@@ -147,7 +145,8 @@ class Numbering:
         if not same:
             return {}
         size, now = polygons.size, polygons.centroids
-        away = _away(now[same], np.array([self.before[numbers[k]] for k in same]), self.lattice)
+        before = np.array([self.before[numbers[k]] for k in same])
+        away = shortest(now[same] - before, self.lattice)
         distance = np.linalg.norm(away, axis=1)
         drift = np.linalg.norm(away - np.median(away, axis=0), axis=1)
         if distance.max() <= self.largest_jump * size or drift.max() <= _CLOSE * size:
@@ -160,18 +159,6 @@ class Numbering:
         if not np.isin(np.array(same)[distance > _CLOSE * size], certain).all():
             return {}
         return {int(k): int(given[nearest[k]]) for k in certain}
-
-
-def _away(
-    places: Float[np.ndarray, "n 2"],
-    origins: Float[np.ndarray, "n 2"],
-    lattice: Float[np.ndarray, "2 2"] | None,
-) -> Float[np.ndarray, "n 2"]:
-    """The shortest vectors from points to others."""
-    away = places - origins
-    if lattice is None:
-        return away
-    return np.asarray(Periodic(jnp.asarray(lattice)).shortest(jnp.asarray(away)))
 
 
 def _nearest(

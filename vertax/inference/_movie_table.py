@@ -13,7 +13,7 @@ from vertax._base.checks import as_float64, check_number
 from vertax.inference._movie import Movie, Repair
 from vertax.inference._movie_polygons import Numbering, Polygons, check_given, polygons_of
 from vertax.initialise import PolygonTissue
-from vertax.initialise._nearby_corners import SharedCorners, build_within, share_corners
+from vertax.initialise._nearby_corners import build_within, share_corners
 from vertax.initialise._polygons import checked_lattice, tissue_from_corners
 from vertax.io import read_table
 from vertax.io._read_table import column, whole_numbers
@@ -137,7 +137,7 @@ def _one_frame(
     """The tissue of a frame, the numbers of cells that fill holes, and those of cells that were mended."""
     names, size, places = polygons.names, polygons.size, polygons.places
 
-    def build(within: float) -> tuple[PolygonTissue, list[int], SharedCorners]:
+    def build(within: float):
         shared = share_corners(places, polygons.corners, polygons.images, lattice, within)
         cells, added = shared.cells.copy(), []
         if box is None:

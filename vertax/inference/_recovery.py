@@ -18,7 +18,7 @@ def pearson(true: Values, inferred: Values) -> Float[np.ndarray, "..."]:
     - `true`, `inferred`: the parameters; leading axes are those of a batch.
 
     **Returns:** the correlation, of each member of a batch; NaN where the true or the inferred ones are
-    all equal.
+    all equal up to rounding.
 
     **Raises:**
 
@@ -27,7 +27,9 @@ def pearson(true: Values, inferred: Values) -> Float[np.ndarray, "..."]:
     true, inferred = _alike(true, inferred)
     a, b = (x - x.mean(axis=-1, keepdims=True) for x in (true, inferred))
     size = np.sqrt(np.sum(a**2, axis=-1) * np.sum(b**2, axis=-1))
-    varied = (np.ptp(true, axis=-1) > 0) & (np.ptp(inferred, axis=-1) > 0)
+    # The variance of values that are constant up to rounding is rounding error.
+    varies = [np.ptp(x, axis=-1) > 1e-12 * np.abs(x).max(axis=-1) for x in (true, inferred)]
+    varied = varies[0] & varies[1]
     return np.where(varied, np.sum(a * b, axis=-1) / np.where(varied, size, 1.0), np.nan)
 
 

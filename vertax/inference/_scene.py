@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key
 
+from vertax._base.checks import check_choice
 from vertax.energies import ShapeFactorEnergy
 from vertax.initialise import periodic_voronoi
 from vertax.mesh import Tissue
@@ -66,14 +67,8 @@ def shape_factor_scene(
 
     - `ValueError` for an unknown `guess` or `start`, or if the hidden tissue does not reach equilibrium.
     """
-    for name, value, options in (
-        ("guess", guess, ("redrawn", "mean")),
-        ("start", start, ("target", "first")),
-    ):
-        if value not in options:
-            raise ValueError(
-                f"Argument `{name}` must be {options[0]!r} or {options[1]!r}, but is {value!r}."
-            )
+    check_choice("guess", guess, ("redrawn", "mean"))
+    check_choice("start", start, ("target", "first"))
     response = Relaxation() if response is None else response
     if target_response is None:
         target_response = Relaxation(transitions=response.transitions)

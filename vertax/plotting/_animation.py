@@ -10,13 +10,12 @@ from typing import Any, SupportsFloat, TypeAlias
 import numpy as np
 from jaxtyping import Array, Bool, Real
 from matplotlib.animation import FFMpegWriter, PillowWriter
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from vertax._base.atomic import atomic_draft
+from vertax._base.checks import check_number
 from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._colours import Colours, add_bar
@@ -167,8 +166,7 @@ def _check(
             f"shapes {sorted(sizes)}."
         )
     _check_timing(fps, last_frame_seconds, dpi)
-    if not mark_t1 >= 0:
-        raise ValueError(f"Argument `mark_t1` must not be negative, but is {mark_t1}.")
+    check_number("mark_t1", mark_t1, at_least=0)
     if captions is not None and len(captions) != len(frames):
         raise ValueError(
             f"Argument `captions` must have one text for each of the {len(frames)} frames, but has "
@@ -177,13 +175,9 @@ def _check(
 
 
 def _check_timing(fps: float, last_frame_seconds: float, dpi: int) -> None:
-    for name, value in (("fps", fps), ("dpi", dpi)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
-    if not last_frame_seconds >= 0:
-        raise ValueError(
-            f"Argument `last_frame_seconds` must not be negative, but is {last_frame_seconds}."
-        )
+    check_number("fps", fps, above=0)
+    check_number("dpi", dpi, above=0)
+    check_number("last_frame_seconds", last_frame_seconds, at_least=0)
 
 
 def _cell_values(cells: CellValues | None, frames: list[Tissue]) -> np.ndarray | None:
@@ -223,7 +217,11 @@ def _pictures(
     views = [view_of(drawing.polygons()[0], drawing.box) for drawing in drawings]
     low, high = np.min([v[0] for v in views], axis=0), np.max([v[1] for v in views], axis=0)
     with _style.house_style():
-        figure, ax = _figure(high - low, values is not None, captions is not None, dpi)
+        width, height = _style.size_of(high - low)
+        height += 0.25 * (captions is not None) + 0.1
+        room = 0.8 * (values is not None) + 0.1
+        figure, ((ax,),) = _style.new_figure(width=width, height=height, room=room)
+        figure.set_dpi(dpi)
         if values is not None:
             low_colour, high_colour = colours.limits(values)  # of all frames together
             colours = colours._replace(low=low_colour, high=high_colour)
@@ -256,14 +254,6 @@ def _placed(frames: list[Tissue]) -> list[Drawing]:
         near = drawings[-1].centroids if drawings else None
         drawings.append(Drawing(tissue, near=near))
     return drawings
-
-
-def _figure(extent: np.ndarray, bar: bool, caption: bool, dpi: int) -> tuple[Figure, Axes]:
-    width, height = _style.size_of(extent)
-    layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04)
-    size = (width + 0.8 * bar + 0.1, height + 0.25 * caption + 0.1)
-    figure = Figure(figsize=size, dpi=dpi, layout=layout)
-    return figure, figure.subplots()
 
 
 def _pixels(figure: Figure) -> np.ndarray:

@@ -9,8 +9,11 @@ from jaxtyping import Array, Float, Real, Shaped
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.patheffects import withStroke
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
+from vertax._base.checks import check_number
 from vertax._base.pixels import PixelSizeLike, check_pixel_size, pixel_sides
 from vertax.plotting import _style
 
@@ -138,45 +141,28 @@ def scale_bar(
 
     - `ValueError` if a length is not positive.
     """
-    for name, value in (("unit_length", unit_length), ("length", length)):
-        if value is not None and not (np.isfinite(float(value)) and float(value) > 0):
-            raise ValueError(f"Argument `{name}` must be positive, but is {value}.")
+    check_number("unit_length", unit_length, above=0)
+    if length is not None:
+        check_number("length", length, above=0)
     unit_length = float(unit_length)
     left, right = sorted(ax.get_xlim())
     length = float(_round_length((right - left) / unit_length / 4) if length is None else length)
     over_image = bool(ax.images)
     colour = "w" if over_image else _style.INK
-    end = right - 0.04 * (right - left)
-    height = 0.05 if over_image else -0.03
-    # x in units of length, y in fractions of the axes: independent of the direction of y.
-    with _style.house_style():
-        transform = ax.get_xaxis_transform()
-        style: dict[str, Any] = {"transform": transform, "clip_on": False, "zorder": 5}
-        (line,) = ax.plot(
-            [end - length * unit_length, end],
-            2 * [height],
-            color=colour,
-            lw=2,
-            scalex=False,
-            scaley=False,
-            solid_capstyle="butt",
-            **style,
-        )
-        text = ax.annotate(
-            f"{length:g} {unit}".strip(),
-            (end - length * unit_length / 2, height),
-            (0, 3 if over_image else -3),
-            xycoords=transform,
-            textcoords="offset points",
-            ha="center",
-            va="bottom" if over_image else "top",
-            color=colour,
-            size=7,
-            zorder=5,
-        )
+    place: dict[str, Any] = {"loc": "lower right", "label_top": True, "borderpad": 1.2}
+    if not over_image:
+        place = {"loc": "upper right", "bbox_to_anchor": (1, 0), "bbox_transform": ax.transAxes}
+    label, size = f"{length:g} {unit}".strip(), length * unit_length
+    font = FontProperties(size=7)
+    bar = AnchoredSizeBar(
+        ax.transData, size, label, color=colour, sep=3, prop=font, frameon=False, **place
+    )
+    (line,), (text,) = bar.size_bar.get_children(), bar.txt_label.get_children()
+    line.set(linewidth=2)
     if over_image:  # white with a black border is readable on any image
-        line.set_path_effects([withStroke(linewidth=line.get_linewidth() + 1.6, foreground="k")])
+        line.set_path_effects([withStroke(linewidth=3.6, foreground="k")])
         text.set_path_effects([withStroke(linewidth=1.8, foreground="k")])
+    ax.add_artist(bar)
 
 
 def _round_length(most: float) -> float:

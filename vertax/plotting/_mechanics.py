@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from vertax.mesh import Drawing, Periodic, Tissue
+from vertax._base.checks import check_number
+from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._tissue import plot_tissue, single
 
@@ -85,17 +86,13 @@ def plot_mode(
 
     - `ValueError` for displacements of the wrong shape, or a scale that is not positive.
     """
-    places = np.asarray(single(tissue).vertices, float)
+    drawing = Drawing(single(tissue))
+    places = drawing.lines[::3, 0]  # each vertex at one of its cells
     moves = _shaped("displacements", displacements, places.shape)
     alive = np.asarray(tissue.topology.alive_vertices)
     unit = _unit(np.linalg.norm(moves[alive], axis=1), scale)
-    size = float(np.sqrt(np.mean(np.abs(tissue.areas), where=np.asarray(tissue.alive))))
-    if isinstance(tissue.boundary, Periodic):
-        lattice = np.asarray(tissue.boundary.lattice, float)
-        fractions = places @ np.linalg.inv(lattice)
-        places = (fractions - np.floor(fractions)) @ lattice
     ax = plot_tissue(tissue, **options)
-    arrows = size * moves / unit
+    arrows = drawing.cell_size * moves / unit
     ax.quiver(
         *places[alive].T,
         *arrows[alive].T,
@@ -121,6 +118,5 @@ def _unit(sizes: np.ndarray, scale: SupportsFloat | None) -> float:
     """The size that is drawn as long as a cell: by default the largest, or 1 if all are 0."""
     if scale is None:
         return float(sizes.max()) or 1.0
-    if not float(scale) > 0:
-        raise ValueError(f"Argument `scale` must be positive, but is {scale}.")
+    check_number("scale", scale, above=0)
     return float(scale)

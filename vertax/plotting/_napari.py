@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 
 from vertax._base.pixels import pixel_sides
+from vertax.plotting._colours import Colours
 from vertax.tensions import InferredTensions
 
 _POINTS = 13
@@ -87,8 +88,5 @@ def tension_colours(tensions: np.ndarray, colours: str) -> dict[str, Any]:
 
 def limits(values: np.ndarray) -> tuple[float, float]:
     """Limits of the colours: the smallest and the largest finite value, or 0 and 1."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 1.0
-    low, high = float(finite.min()), float(finite.max())
+    low, high = Colours().limits(values)
     return low, max(high, low + 1e-6)

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
+from vertax._base.checks import check_choice
 from vertax._base.pixels import PixelSizeLike
 from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
@@ -77,8 +78,11 @@ def plot_tissues(
     _style.one_of(axes, figure, "axes")
     _check(tissues, axes, image, colorbar)
     drawings = {name: None if t is None else Drawing(single(t)) for name, t in tissues.items()}
+    # Check before making a figure: one of pyplot would stay open after an error.
     cell_values = _values("cells", cells, tissues)
     edge_values = _values("edges", edges, tissues)
+    for drawing in filter(None, drawings.values()):
+        checked("mask", mask, drawing.n_cells)
     cell_colours, all_cells = _common(Colours(cmap, vmin, vmax, label), cell_values)
     edge_map = edge_cmap or (EDGES_ON_PALE if image is None else EDGES_ON_DARK)
     edge_colours, all_edges = _common(
@@ -92,14 +96,6 @@ def plot_tissues(
         )
         if values is not None and colorbar in (True, name)
     ]
-    # Check before making a figure: one of pyplot would stay open after an error.
-    for drawing, panel_cells, panel_edges in zip(
-        drawings.values(), cell_values, edge_values, strict=True
-    ):
-        if drawing is not None:
-            checked("cells", panel_cells, drawing.n_cells)
-            checked("edges", panel_edges, drawing.n_edges)
-            checked("mask", mask, drawing.n_cells)
     views = _views(drawings, mask) if image is None else [None] * len(drawings)
     with _style.house_style():
         if axes is None:
@@ -152,10 +148,7 @@ def plot_tissues(
 def _check(
     tissues: Mapping[str, Tissue | None], axes: Any, image: np.ndarray | None, colorbar: bool | str
 ) -> None:
-    if colorbar not in (True, False, "cells", "edges"):
-        raise ValueError(
-            f'Argument `colorbar` must be true, false, "cells" or "edges", but is {colorbar!r}.'
-        )
+    check_choice("colorbar", colorbar, (True, False, "cells", "edges"))
     if not tissues:
         raise ValueError("Argument `tissues` must have at least one panel, but is empty.")
     if image is None and None in tissues.values():
@@ -174,14 +167,19 @@ def _values(
 ) -> list[np.ndarray | None]:
     if values is None:
         return [None] * len(tissues)
-    if callable(values):
-        return [None if t is None else np.asarray(values(t)) for t in tissues.values()]
-    if len(values) != len(tissues):
+    if not callable(values) and len(values) != len(tissues):
         raise ValueError(
             f"Argument `{name}` must have values for each of the {len(tissues)} panels, but has "
             f"{len(values)}."
         )
-    return [None if panel is None else np.asarray(panel) for panel in values]
+    panels = []
+    for k, tissue in enumerate(tissues.values()):
+        panel = None
+        if tissue is not None:
+            panel = values(tissue) if callable(values) else values[k]
+            panel = checked(name, panel, tissue.n_cells if name == "cells" else tissue.n_edges)
+        panels.append(panel)
+    return panels
 
 
 def _common(colours: Colours, values: list[np.ndarray | None]) -> tuple[Colours, np.ndarray | None]:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from vertax.inference import pearson, relative_error
 from vertax.plotting import _style
 
 _DIAGONAL = "recovery"
@@ -129,11 +130,9 @@ def _ends(ax: Axes, values: np.ndarray) -> tuple[float, float]:
 def _agreement(true: np.ndarray, inferred: np.ndarray) -> str:
     """Pearson's r and the mean relative error, where they are defined."""
     lines = []
-    # Values that are constant up to rounding have no correlation: their variance is rounding error.
-    varies = [x.size > 0 and np.ptp(x) > 1e-12 * np.abs(x).max() for x in (true, inferred)]
-    if all(varies):
-        lines.append(f"$r$ = {np.corrcoef(true, inferred)[0, 1]:.4f}")
+    if true.size and np.isfinite(correlation := pearson(true, inferred)):
+        lines.append(f"$r$ = {correlation:.4f}")
     if true.size and np.all(true != 0):
-        error = float(np.mean(np.abs((inferred - true) / true)))
+        error = relative_error(true, inferred)
         lines.append(f"mean relative\nerror {100 * error:.2g} %")  # narrow: it covers no points
     return "\n".join(lines)

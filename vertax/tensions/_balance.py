@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import coo_array, csr_array
 
 from vertax.tensions._observed_geometry import ObservedGeometry
 
@@ -81,55 +81,33 @@ def equations(geometry: ObservedGeometry, *, straight: bool = False) -> Equation
 # each of its ends (Ishihara & Sugimura 2012, doi:10.1016/j.jtbi.2012.08.017). Together with the tension this
 # is the pull of an arc, to first order in α, and the law of Laplace is no separate equation.
 # On a surface the directions are those in the tangent planes, and the α half of the geodesic turning.
-def angles(geometry: ObservedGeometry, which: Equations) -> Float[np.ndarray, " angles"]:
-    """Directions of tangents, or of straight edges, three for each junction, and angles of arcs."""
-    direction, arc = _angles_in_image(geometry, which)
-    if geometry.lift is not None:
-        direction, _ = geometry.lift.turned(
-            _vectors(geometry, which, direction), which.junctions, straight=which.n_arcs == 0
-        )
-        first, slope = geometry.lift.turn[which.edges].T
-        arc = first[: len(arc)] + slope[: len(arc)] * arc
-    return np.concatenate([direction.ravel(), arc])
-
-
-def lifted_slopes(geometry: ObservedGeometry, which: Equations) -> Float[np.ndarray, " angles"]:
-    """Derivatives of these angles by those in the image; 1 in the plane."""
-    if geometry.lift is None:
-        return np.ones(which.n_directions + which.n_arcs)
-    direction, arc = _angles_in_image(geometry, which)
-    _, slope = geometry.lift.turned(
-        _vectors(geometry, which, direction), which.junctions, straight=which.n_arcs == 0
-    )
-    return np.concatenate([slope.ravel(), geometry.lift.turn[which.edges, 1][: len(arc)]])
-
-
-def _vectors(
-    geometry: ObservedGeometry, which: Equations, direction: Float[np.ndarray, "junctions 3"]
-) -> Float[np.ndarray, "junctions 3 2"]:
-    """Chords of straight edges in the image, or unit tangents of arcs, away from their junctions."""
-    unit = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
-    if which.n_arcs:
-        return unit
-    edge = geometry.half_edge[which.junctions]
-    return np.linalg.norm(geometry.chord, axis=1)[edge][..., None] * unit
-
-
-def _angles_in_image(
+def angles(
     geometry: ObservedGeometry, which: Equations
-) -> tuple[Float[np.ndarray, "junctions 3"], Float[np.ndarray, " arcs"]]:
-    """Directions and angles of arcs in the image."""
+) -> tuple[Float[np.ndarray, " angles"], Float[np.ndarray, " angles"]]:
+    """Directions of tangents, or of straight edges, three for each junction, and angles of arcs; and their
+    derivatives by those in the image, which are 1 in the plane."""
     edge, forward = geometry.half_edge[which.junctions], geometry.forward[which.junctions]
     chord = np.arctan2(geometry.chord[:, 1], geometry.chord[:, 0])[edge]
-    if which.lever is not None:
-        return np.where(forward, chord, chord + np.pi), np.zeros(0)
-    away = chord + geometry.bend[edge, 0] + geometry.bend[edge, 1] - geometry.angle[edge]
-    back = chord + geometry.bend[edge, 0] - geometry.bend[edge, 1] + geometry.angle[edge] + np.pi
-    return np.where(forward, away, back), geometry.angle[which.edges]
+    away, back, arc, length = chord, chord + np.pi, np.zeros(0), 1.0
+    if which.n_arcs:
+        middle, half = chord + geometry.bend[edge, 0], geometry.angle[edge]
+        away = middle + geometry.bend[edge, 1] - half
+        back = middle - geometry.bend[edge, 1] + half + np.pi
+        arc = geometry.angle[which.edges]
+    else:
+        length = np.linalg.norm(geometry.chord, axis=1)[edge][..., None]
+    direction, lift = np.where(forward, away, back), geometry.lift
+    if lift is None:
+        return np.concatenate([direction.ravel(), arc]), np.ones(direction.size + len(arc))
+    vectors = length * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    direction, rate = lift.turned(vectors, which.junctions, straight=which.n_arcs == 0)
+    first, slope = lift.turn[which.edges[: len(arc)]].T
+    lifted = np.concatenate([direction.ravel(), first + slope * arc])
+    return lifted, np.concatenate([rate.ravel(), slope])
 
 
 def angle_slopes(geometry: ObservedGeometry, which: Equations) -> csr_array:
-    """Jacobian of these angles with respect to vertices, angles and bends."""
+    """Jacobian of the angles in the image with respect to vertices, angles and bends."""
     edge, forward = (
         geometry.half_edge[which.junctions].ravel(),
         geometry.forward[which.junctions].ravel(),
@@ -150,8 +128,7 @@ def angle_slopes(geometry: ObservedGeometry, which: Equations) -> csr_array:
     if which.lever is None:
         arcs = which.n_directions + np.arange(which.n_arcs)
         entries.append((arcs, first + which.edges, np.ones(len(arcs))))
-    slopes = _matrix(entries, (which.n_directions + which.n_arcs, geometry.n_geometry))
-    return csr_array(diags_array(lifted_slopes(geometry, which)) @ slopes)
+    return _matrix(entries, (which.n_directions + which.n_arcs, geometry.n_geometry))
 
 
 def forces(

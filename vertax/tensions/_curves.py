@@ -62,8 +62,6 @@ class Fitted(NamedTuple):
     """Distance along an edge at which the errors of two points are independent, a length."""
     bending: float
     """Standard deviation of the bends, in radians."""
-    prior_noise: float
-    """Noise relative to which the prior was weighted."""
     crisp: bool = False
     """Whether the grain is the only error of the points."""
     bends: bool = False
@@ -211,7 +209,7 @@ def fit_curves(
             break
     spread = float(np.sqrt(np.sum(weight * rest**2) / max(np.sum(weight), 1e-300)))
     spread = max(spread, 1e-12 * tissue.size)
-    parts = rest, csc_array(weighted), weight, factor, apart, bending, noise
+    parts = rest, csc_array(weighted), weight, factor, apart, bending
     return Fitted(moved, normal, spread, *parts)
 
 

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
 from vertax._base.blas import one_blas_thread
-from vertax._base.checks import check_integer
+from vertax._base.checks import as_times, check_integer
 from vertax.mesh import Free, Tissue
 from vertax.tensions._curves import Points, correlation_length
 from vertax.tensions._inferred import InferredTensions, MotionFit
@@ -86,9 +86,7 @@ class EdgeMotion:
                 "Arguments `tissues`, `chains` and `times` must hold two frames or more, and as many of "
                 f"each, but hold {len(tissues)}, {len(chains)} and {len(times)}."
             )
-        steps = np.diff(np.asarray(times, float))
-        if not (steps > 0).all():
-            raise ValueError(f"Argument `times` must increase, but is {list(times)}.")
+        as_times(times)
         first = tissues[0]
         if not isinstance(first.boundary, Free):
             raise ValueError(
@@ -110,7 +108,7 @@ class EdgeMotion:
                     )
                 places[np.array(row)] = chain
         self.tissue, self.substeps = first, substeps
-        self._dt, self._points, self._rows = steps, points, rows
+        self._dt, self._points, self._rows = np.diff(np.asarray(times, float)), points, rows
         self._pieces = np.concatenate([np.stack([row[:-1], row[1:]], axis=1) for row in rows])
         self._edge = np.repeat(np.arange(len(rows)), [len(row) - 1 for row in rows])
         # Coordinates are x and y of one point after the other; a piece has four, and two cells.
@@ -128,9 +126,9 @@ class EdgeMotion:
         lengths = np.stack([self._ways(x.ravel())[1] for x in points])
         self._spacing = float(np.median(lengths))
         within = ~np.asarray(first.topology.on_outline)
-        self._use(np.tile(within, (len(steps), 1)))
+        self._use(np.tile(within, (len(self._dt), 1)))
         # Edges that shrink to a point, or grow from one, move as observed.
-        rate = 4 * self._pace() * steps[:, None] / np.minimum(lengths[1:], lengths[:-1])
+        rate = 4 * self._pace() * self._dt[:, None] / np.minimum(lengths[1:], lengths[:-1])
         mean = [np.bincount(self._edge, each) / np.bincount(self._edge) for each in rate]
         self._use(within & (np.stack(mean) < _FASTEST))
 

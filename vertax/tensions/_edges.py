@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Bool
 from scipy.sparse import csc_array, diags_array
 
 from vertax.tensions._balance import equations
-from vertax.tensions._curves import Fitted, Points, read_courses
+from vertax.tensions._curves import Fitted
 from vertax.tensions._errors import Errors
 from vertax.tensions._observability import observability, patches
 from vertax.tensions._observed_geometry import ObservedGeometry
@@ -20,42 +18,12 @@ from vertax.tensions._solve import Balance, System, choose_errors, solve
 _DECISIVE = 5.0
 
 
-class Solution(NamedTuple):
-    """A balance of forces in a fitted geometry."""
-
-    system: System
-    balance: Balance
-
-
 def vertices_only(geometry: ObservedGeometry, noise: float) -> Fitted:
     """The vertices as they are, with independent noise, of straight edges without points."""
     n = geometry.n_geometry
     precision = np.where(np.arange(n) < 2 * geometry.n_vertices, 1.0, 1e12)
-    empty = (
-        np.zeros(0),
-        csc_array((n, 0)),
-        np.zeros(0),
-        np.ones(len(geometry.angle)),
-        0.0,
-        0.0,
-        noise,
-    )
+    empty = np.zeros(0), csc_array((n, 0)), np.zeros(0), np.ones(len(geometry.angle)), 0.0, 0.0
     return Fitted(np.zeros(n), csc_array(diags_array(precision)), noise, *empty, crisp=True)
-
-
-def fit(
-    geometry: ObservedGeometry,
-    points: Points,
-    grain: float,
-    *,
-    apart: float | None,
-    noise: float | None,
-) -> Fitted:
-    """Curves through the points of edges that end at a junction, see `read_courses`; or no fit of vertices
-    without points."""
-    if not len(points.edge):
-        return vertices_only(geometry, grain if noise is None else noise)
-    return read_courses(geometry, points, grain, apart=apart, noise=noise)
 
 
 # Both describe the same angles. With straight edges, the angles of arcs are noise, α ~ N(0, ν² C); with arcs
@@ -68,7 +36,7 @@ def solution(
     straight: bool | None,
     known_noise: bool,
     prior: float | None,
-) -> Solution:
+) -> tuple[System, Balance]:
     """The balance of forces with arcs or with straight edges.
 
     Errors of the model, widths of the priors, and the choice between arcs and straight edges are those of
@@ -82,7 +50,7 @@ def solution(
     - `known_noise`: whether the noise is at most that of the points.
     - `prior`: standard deviation of tensions about 1.
 
-    **Returns:** the [`Solution`][vertax.tensions._edges.Solution].
+    **Returns:** the sum of squares and its solution.
     """
     fitted = geometry.moved(curves.change)
 
@@ -107,7 +75,7 @@ def solution(
     assert best is not None
     _, errors, flat, systems = best
     tissue = systems[0] if len(parts) == 1 else system(fitted, flat=flat)
-    return Solution(tissue, solve(tissue, errors))
+    return tissue, solve(tissue, errors)
 
 
 def _density_of_arcs(arcs: System, noise: float) -> float:

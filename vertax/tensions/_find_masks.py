@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from vertax._base.checks import describe
-from vertax.initialise._mask_arguments import without_single_axes
 from vertax.io import read_stack
 from vertax.tensions._infer_tensions import infer_tensions, pixels_of_file
 from vertax.tensions._inferred import InferredTensions
-from vertax.tensions._mask import load_array, read_mask
+from vertax.tensions._mask import planes_of, read_mask, read_pixels
 
 MaskSource: TypeAlias = Shaped[np.ndarray | Array, "..."] | str | os.PathLike[str]
 
@@ -87,13 +86,13 @@ def find_masks(
             return _frames_of(files[0])
         return _named(files)
     if isinstance(masks, np.ndarray | Array):
-        pixels = without_single_axes(np.asarray(masks))
-        if pixels.ndim < 2:
+        planes = planes_of(np.asarray(masks))
+        if planes.ndim < 3:
             raise ValueError(
                 "Argument `masks` must have shape (rows, columns) or (frames, rows, columns), but its shape "
-                f"is {pixels.shape}."
+                f"is {masks.shape}."
             )
-        return _planes(pixels)
+        return [MaskFrame(*frame) for frame in enumerate(planes)]
     if not isinstance(masks, Sequence):
         raise TypeError(
             "Argument `masks` must be a folder, a pattern, a file, an array or a list of these, but is "
@@ -146,15 +145,7 @@ def _frames_of(file: Path) -> list[MaskFrame]:
     if file.suffix.lower() not in (".npy", ".tif", ".tiff") or file.name.endswith("_seg.npy"):
         return single
     try:
-        pixels = load_array(file) if file.suffix == ".npy" else read_stack(file)
+        frames = planes_of(read_pixels(file, "masks", read_stack))
     except ValueError:  # colours, or no image: the reader of masks has the message
         return single
-    frames = _planes(without_single_axes(pixels))
-    return single if len(frames) == 1 else [frame._replace(file=file) for frame in frames]
-
-
-def _planes(pixels: Shaped[np.ndarray, "..."]) -> list[MaskFrame]:
-    """The frames of an array; a last axis of 3 or 4 is one of colours."""
-    if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4)):
-        return [MaskFrame(0, pixels)]
-    return [MaskFrame(k, p) for k, p in enumerate(pixels.reshape(-1, *pixels.shape[-2:]))]
+    return single if len(frames) == 1 else [MaskFrame(*x, file) for x in enumerate(frames)]

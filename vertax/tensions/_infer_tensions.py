@@ -14,7 +14,7 @@ from jaxtyping import Array, Int, Shaped
 from vertax._base.announce import announce_compilations
 from vertax._base.available_memory import check_memory
 from vertax._base.blas import one_blas_thread
-from vertax._base.checks import check_number, describe
+from vertax._base.checks import check_choice, check_number, describe
 from vertax._base.phases import phases, start_phase
 from vertax._base.pixels import PixelSize, pixel_length
 from vertax.initialise import MaskReport, Segmentation, from_labels
@@ -25,13 +25,20 @@ from vertax.io._surface_evolver import is_surface_evolver
 from vertax.mesh import Tissue, geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import equations
-from vertax.tensions._curves import Points
-from vertax.tensions._edges import fit, solution
+from vertax.tensions._curves import Points, read_courses
+from vertax.tensions._edges import solution, vertices_only
 from vertax.tensions._inferred import InferredTensions
 from vertax.tensions._lift import lifted
-from vertax.tensions._mask import labels_and_lines, load_array
+from vertax.tensions._mask import labels_and_lines, read_pixels
 from vertax.tensions._observed_geometry import observed_geometry
-from vertax.tensions._outcome import outcome
+from vertax.tensions._outcome import (
+    assembled,
+    moved_by_fit,
+    outline_errors,
+    relative,
+    spread,
+    with_outline_of_mask,
+)
 
 # Noise of a tissue without an image, and of the points of a foam, relative to the cell diameter; and the
 # number of points of an edge without a course.
@@ -132,10 +139,7 @@ def infer_tensions(
     for name, value in (("noise", noise), ("prior", prior), ("plane_distance", plane_distance)):
         if value is not None:
             check_number(name, value, above=0)
-    if edges not in (None, "arcs", "straight"):
-        raise ValueError(
-            f"Argument `edges` must be 'arcs', 'straight' or None, but is {describe(edges)}."
-        )
+    check_choice("edges", edges, ("arcs", "straight", None))
     start_phase("reading")
     source, sized = mask, pixel_size is not None
     if isinstance(source, str | os.PathLike) and is_surface_evolver(Path(source)):
@@ -157,28 +161,26 @@ def infer_tensions(
         )
         source = _across_lines(source, line_width)
     if isinstance(height, str | os.PathLike):
-        height = _heights_of_file(Path(height))
-    if isinstance(source, Segmentation):
-        surface = source.tissue.surface
-        if height is not None:
-            surface = surface_of(source, height, plane_distance, unknown_height, sized=sized)
-        course = _of_mask(source, noise)
-    elif height is not None and not isinstance(height, AbstractSurface):
+        height = read_pixels(Path(height), "height", read_image)
+    if isinstance(source, Segmentation) and height is not None:
+        height = surface_of(source, height, plane_distance, unknown_height, sized=sized)
+    if height is not None and not isinstance(height, AbstractSurface):
         raise TypeError(
             "Argument `height` must be a surface for a source without pixels, such as a "
             f"vertax.surfaces.HeightMap, but is {describe(height)}."
         )
+    if isinstance(source, Segmentation):
+        surface, course = source.tissue.surface, _of_mask(source, noise)
     elif isinstance(source, Foam):
-        surface = source.surface if height is None else height
-        course = _of_foam(source, noise)
+        surface, course = source.surface, _of_foam(source, noise)
     elif isinstance(source, Tissue):
-        surface = source.surface if height is None else height
-        course = _of_tissue(source.with_surface(None), noise)
+        surface, course = source.surface, _of_tissue(source.with_surface(None), noise)
     else:
         raise TypeError(
             "Argument `mask` must be a mask, a file, a Segmentation, a Foam or a Tissue, but "
             f"is {describe(mask)}. For several masks use vx.tensions.infer_tensions_of_masks."
         )
+    surface = surface if height is None else height
     tissue, report = course.tissue, course.report
     if edges == "arcs" and not tissue.inner_arcs:
         raise ValueError(
@@ -197,7 +199,11 @@ def infer_tensions(
     used = np.isin(course.points.edge, which.edges)
     points = Points(*(of[used] for of in course.points))
     start_phase("geometry")
-    curves = fit(geometry, points, course.grain, apart=course.apart, noise=course.noise)
+    if len(points.edge):
+        options = {"apart": course.apart, "noise": course.noise}
+        curves = read_courses(geometry, points, course.grain, **options)
+    else:
+        curves = vertices_only(geometry, course.noise or course.grain)
     start_phase("balance")
     if surface is not None:
         geometry = geometry._replace(lift=lifted(geometry, curves.change, surface))
@@ -213,18 +219,28 @@ def infer_tensions(
     start_phase("errors")
     # Vertices in a mask are corners of pixels, so edges of length 0 differ from all others.
     four_fold = geometry_of(tissue).edge_lengths < 0.5 * course.grain
-    source = course.labels, course.pixel_size, four_fold, report
-    return outcome(tissue, course.points, curves, system.which, balance, source, surface)
-
-
-def _heights_of_file(file: Path) -> np.ndarray:
-    """The numbers in an image, or in a file of NumPy."""
-    if file.suffix.lower() == ".npy":
-        return load_array(file, "height")
-    try:
-        return read_image(file)
-    except ValueError as error:
-        raise ValueError(str(error).replace("`path`", "`height`")) from error
+    which, fitted = system.which, moved_by_fit(tissue, curves.change)
+    if report is not None:
+        fitted = with_outline_of_mask(fitted, course.points, curves.change, which.edges)
+    distance = outline_errors(fitted, course.points, curves.change)
+    return assembled(
+        fitted,
+        (which.edges, which.cells),
+        relative(balance, which, curves),
+        balance.posterior.covariances,
+        four_fold=four_fold,
+        surface=surface,
+        labels=np.asarray(course.labels),
+        noise=float(curves.noise * balance.errors.noise),
+        correlation=float(curves.apart),
+        bending=curves.bending,
+        edges="straight" if which.n_arcs == 0 else "arcs",
+        errors={name: float(value) for name, value in balance.errors._asdict().items()},
+        pixel_size=course.pixel_size,
+        mask_report=report,
+        short=spread(tissue.n_edges, which.edges, balance.loose, False),
+        outline_errors=distance / pixel_length(course.pixel_size or 1.0),
+    )
 
 
 class _Course(NamedTuple):

@@ -339,35 +339,21 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
 
     **Returns:** a sentence for each kind of change.
     """
-    groups = (
-        (
-            ("hole",),
-            "the mask has holes, which are no cells: the tensions at their sides are not determined",
-        ),
-        (
-            ("closed hole",),
-            "the mask has holes that were closed: contacts across them are not determined",
-        ),
-        (
-            ("new cell",),
-            "labels are in several pieces as large as cells, which became cells with new labels (do the "
-            "numbers start again after 255 or 65535?)",
-        ),
-        (("left out",), "labelled pixels belong to no cell"),
-        (("absorbed",), "labels are no cells"),
-    )
+    groups = {
+        "hole": "the mask has holes, which are no cells: the tensions at their sides are not determined",
+        "closed hole": "the mask has holes that were closed: contacts across them are not determined",
+        "new cell": "labels are in several pieces as large as cells, which became cells with new labels (do "
+        "the numbers start again after 255 or 65535?)",
+        "left out": "labelled pixels belong to no cell",
+        "absorbed": "labels are no cells",
+    }
     warnings = []
-    for kinds, text in groups:
-        changes = report.of_kind(*kinds)
+    for kind, text in groups.items():
         # Single pixels off a cell are of no consequence.
-        if kinds == ("left out",):
-            changes = [
-                change for change in changes if change.pixels > 0.03 * np.median(report.pixels)
-            ]
+        least = 0.03 * np.median(report.pixels) if kind == "left out" else 0
+        changes = [str(change) for change in report.of_kind(kind) if change.pixels > least]
         if changes:
-            places = "; ".join(map(str, changes[:_PLACES]))
-            more = f"; and {len(changes) - _PLACES} more" if len(changes) > _PLACES else ""
-            warnings.append(f"{text}: {places}{more}")
+            warnings.append(f"{text}: {_listed(changes, '; ')}")
     stray = len(report.of_kind("piece", "absorbed", "left out"))
     if stray > max(_STRAY, len(report.cell_pixels)):
         warnings.append(
@@ -385,24 +371,26 @@ def mask_warnings(report: MaskReport, result: InferredTensions) -> list[str]:
         )
     outline = result.outline_errors
     distance = np.zeros(0) if outline is None else outline / np.sqrt(report.cell_pixels)
-    for errors, limit, text, unit in (
+    far = "are more than 10 % of the root of their area from arcs"
+    for errors, limit, subject, fact, sign in (
         (
             result.area_errors,
             _AREA_ERROR,
-            "areas of {} cells differ by more than 5 % from those of their pixels",
+            "areas",
+            "differ by more than 5 % from those of their pixels",
             "+",
         ),
-        (
-            distance,
-            _OUTLINE_ERROR,
-            "outlines of {} cells are more than 10 % of the root of their area from arcs",
-            "",
-        ),
+        (distance, _OUTLINE_ERROR, "outlines", far, ""),
     ):
         off = np.flatnonzero((np.abs(errors) > limit) & (result.labels[: len(errors)] > 0))
-        if len(off):
-            worst = off[np.argsort(-np.abs(errors[off]))][:_PLACES]
-            cells = ", ".join(f"label {result.labels[k]} ({errors[k]:{unit}.0%})" for k in worst)
-            more = f" and {len(off) - _PLACES} more" if len(off) > _PLACES else ""
-            warnings.append(f"the {text.format(len(off))}: {cells}{more}")
+        worst = off[np.argsort(-np.abs(errors[off]))]
+        cells = [f"label {result.labels[k]} ({errors[k]:{sign}.0%})" for k in worst]
+        if cells:
+            warnings.append(f"the {subject} of {len(cells)} cells {fact}: {_listed(cells, ', ')}")
     return warnings
+
+
+def _listed(places: list[str], separator: str) -> str:
+    """The first places, and the number of the others."""
+    first, more = separator.join(places[:_PLACES]), len(places) - _PLACES
+    return first + (f"{separator}and {more} more" if more > 0 else "")

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from vertax._base.announce import announced_jit
 from vertax.mesh import Tissue, geometry_of
 from vertax.surfaces import AbstractSurface
+from vertax.tensions._inferred import CurvedGeometry
 from vertax.tensions._observed_geometry import Lift, ObservedGeometry
 
 # A point x of the image lies at r(x). With J = ∂r/∂x and the metric g = JᵀJ, the columns of J S⁻¹, S = √g
@@ -26,19 +27,6 @@ _PIECES = 8
 """Intervals along an edge, with one sample in the middle of each."""
 _STEP = 1e-2
 """Change of the angle of an arc, in radians, for the slope of its angle in space."""
-
-
-class SurfaceMeasures(NamedTuple):
-    """The geometry of edges and cells in space."""
-
-    lengths: Float[np.ndarray, " edges"]
-    areas: Float[np.ndarray, " cells"]
-    fabric: Float[np.ndarray, "edges 2 2"]
-    """Integral of t t along each edge, in the bases of tangent planes."""
-    bending: Float[np.ndarray, " edges"]
-    """Integral of the normal curvature along each edge."""
-    slopes: Float[np.ndarray, " cells"]
-    """√(det g - 1) at the mean of the outline: the slope of a height map."""
 
 
 def lifted(
@@ -65,9 +53,12 @@ def lifted(
     )
 
 
-def measured(tissue: Tissue, surface: AbstractSurface) -> SurfaceMeasures:
-    """The geometry in space of a tissue in an image."""
-    geometry = geometry_of(tissue)
+def curved_geometry(
+    tissue: Tissue, surface: AbstractSurface, tensions: Float[np.ndarray, " edges"]
+) -> tuple[CurvedGeometry, Float[np.ndarray, "edges 2 2"]]:
+    """The geometry in space of a tissue in an image, and the integrals of t t along its edges, in the bases
+    of tangent planes."""
+    geometry, m = geometry_of(tissue), tissue.topology
     start = np.asarray(tissue.edge_segments[0], float)
     arc = _along(surface, start, geometry.edge_vectors, geometry.edge_angles)
     middle = start + 0.5 * geometry.edge_vectors
@@ -77,7 +68,19 @@ def measured(tissue: Tissue, surface: AbstractSurface) -> SurfaceMeasures:
     lengths = arc.length
     if tissue.arcs is None:
         lengths = np.linalg.norm(_chords(surface, start, geometry.edge_vectors), axis=1)
-    return SurfaceMeasures(lengths, areas, arc.fabric, arc.bending, slopes)
+    perimeters = np.zeros(tissue.n_cells + 1)
+    for side in geometry.edge_cells.T:
+        np.add.at(perimeters, side, lengths)
+    load = 0.5 * tensions * arc.bending
+    curved = CurvedGeometry(
+        tissue=Tissue(tissue.vertices, m, tissue.boundary, tissue.softening, surface=surface),
+        areas=areas,
+        perimeters=perimeters[:-1],
+        slopes=slopes,
+        lengths=lengths,
+        normal_loads=load[np.asarray(m.edge).reshape(-1, 3)].sum(axis=1),
+    )
+    return curved, arc.fabric
 
 
 class _Arc(NamedTuple):
@@ -85,6 +88,7 @@ class _Arc(NamedTuple):
     angle: np.ndarray
     """Half of the geodesic turning."""
     bending: np.ndarray
+    """Integral of the normal curvature."""
     fabric: np.ndarray
     border: np.ndarray
     """Points in the image at the ends of the intervals."""
@@ -141,7 +145,8 @@ def _areas(
     border: np.ndarray,
     angle: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Areas of the cells in space, by fans of triangles in the image, and slopes at their centres."""
+    """Areas of the cells in space, by fans of triangles in the image, and slopes at the means of their
+    outlines, √(det g - 1)."""
     # The area between an interval, an arc of the angle β, and its chord c is c² (2β - sin 2β) / 8 sin² β.
     part = np.where(angle == 0, 1, angle / _PIECES)
     chord = np.linalg.norm(border[:, 1] - border[:, 0], axis=1)

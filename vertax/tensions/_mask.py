@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label
 
-from vertax._base.checks import check_integer
+from vertax._base.checks import check_choice, check_integer
 from vertax.initialise._mask_arguments import (
     check_bits,
     check_no_picture,
@@ -21,7 +22,6 @@ from vertax.initialise._mask_arguments import (
 from vertax.initialise._pieces import connected_pieces
 from vertax.io._image import read_colours
 
-_KINDS = ("auto", "labels", "outlines")
 # A region at the border of the image that is larger than this, relative to the median cell, is no cell.
 _OUTSIDE = 5.0
 # A region smaller than this, relative to the median cell, is no cell either.
@@ -77,17 +77,14 @@ def labels_and_lines(
     plane: int | None,
 ) -> tuple[Int[np.ndarray, "rows columns"], float]:
     """The labels of [`read_mask`][vertax.tensions.read_mask], and the width of the lines in pixels, or 0."""
-    if kind not in _KINDS:
-        raise ValueError(
-            f"Argument `kind` must be one of {', '.join(map(repr, _KINDS))}, but is {kind!r}."
-        )
+    check_choice("kind", kind, ("auto", "labels", "outlines"))
     if plane is not None:
         check_integer("plane", plane, at_least=0)
     if isinstance(mask, str | os.PathLike):
         pixels = _loaded(Path(mask), plane)
     else:
         pixels = np.ma.filled(mask, 0) if isinstance(mask, np.ma.MaskedArray) else mask
-        pixels = one_plane(np.asarray(pixels), plane)
+        pixels = _one_plane(np.asarray(pixels), plane)
     values = _numbered(pixels)
     if background is not None:
         if not np.any(values == background):
@@ -113,67 +110,60 @@ def labels_and_lines(
     return np.maximum(values, 0), 0.0
 
 
-def one_plane(pixels: np.ndarray, plane: int | None) -> np.ndarray:
-    """The chosen plane of an array, without axes of length 1.
-
-    **Arguments:**
-
-    - `pixels`: shape (rows, columns), (rows, columns, colours) or (planes, rows, columns).
-    - `plane`: number of the plane.
-
-    **Returns:** the plane.
-
-    **Raises:**
-
-    - `ValueError` for a stack without a choice, and for a plane that it does not have.
-    """
+def planes_of(pixels: np.ndarray) -> np.ndarray:
+    """The planes of an array without axes of length 1; a last axis of 3 or 4 is one of colours."""
     pixels = without_single_axes(pixels)
-    colours = pixels.ndim == 3 and pixels.shape[2] in (3, 4)
-    if pixels.ndim > 3 or (pixels.ndim == 3 and not colours):
-        planes = pixels.reshape(-1, *pixels.shape[-2:])
-        if plane is None:
-            raise ValueError(
-                "Argument `mask` must have shape (rows, columns), or a third axis of colours, but its shape "
-                f"is {pixels.shape}, a stack of {len(planes)} planes. Pass one plane of a stack, by the "
-                f"argument `plane`, 0 … {len(planes) - 1}."
-            )
-        if plane >= len(planes):
-            raise ValueError(f"Argument `plane` must lie in 0 … {len(planes) - 1}, but is {plane}.")
-        return planes[plane]
-    if plane:
+    if pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4)):
+        return pixels[None]
+    return pixels.reshape(-1, *pixels.shape[-2:])
+
+
+def _one_plane(pixels: np.ndarray, plane: int | None) -> np.ndarray:
+    """The chosen plane of an array; a `ValueError` for a stack without a choice, or without this plane."""
+    planes = planes_of(pixels)
+    if plane is None and len(planes) != 1:
         raise ValueError(
-            f"Argument `plane` must be 0 or left out for an image of shape {pixels.shape}, but is {plane}."
+            "Argument `mask` must have shape (rows, columns), or a third axis of colours, but its shape "
+            f"is {pixels.shape}, a stack of {len(planes)} planes. Pass one plane of a stack, by the "
+            f"argument `plane`, 0 … {len(planes) - 1}."
         )
-    return pixels
+    if (plane or 0) >= len(planes):
+        raise ValueError(
+            f"Argument `plane` must lie in 0 … {len(planes) - 1} for an image of shape {pixels.shape}, but "
+            f"is {plane}."
+        )
+    return planes[plane or 0]
 
 
 def _loaded(file: Path, plane: int | None) -> np.ndarray:
+    pixels = read_pixels(file, "mask", partial(read_colours, plane=plane))
+    return _one_plane(pixels, plane) if file.suffix.lower() == ".npy" else pixels
+
+
+def read_pixels(file: Path, name: str, read: Callable[[Path], np.ndarray]) -> np.ndarray:
+    """The array in a file of NumPy or Cellpose, or that of another reader; errors name the argument."""
     if not file.exists():
-        raise FileNotFoundError(f"Argument `mask` must name a file, but {file} does not exist.")
+        raise FileNotFoundError(f"Argument `{name}` must name a file, but {file} does not exist.")
+    if file.suffix.lower() != ".npy":
+        try:
+            return read(file)
+        except ValueError as error:
+            raise ValueError(str(error).replace("`path`", f"`{name}`")) from error
     # Cellpose saves a dictionary, which only pickles hold; masks are plain arrays.
-    if file.name.endswith("_seg.npy"):
-        content = np.load(file, allow_pickle=True)
-        content = content.item() if content.dtype == object and content.ndim == 0 else {}
-        if not isinstance(content, dict) or "masks" not in content:
-            raise ValueError(f"{file} must hold `masks`, as Cellpose saves them, but does not.")
-        return one_plane(np.asarray(content["masks"]), plane)
-    if file.suffix.lower() == ".npy":
-        return one_plane(load_array(file), plane)
+    of_cellpose = file.name.endswith("_seg.npy")
     try:
-        return read_colours(file, plane)
-    except ValueError as error:
-        raise ValueError(str(error).replace("`path`", "`mask`")) from error
-
-
-def load_array(file: Path, name: str = "mask") -> np.ndarray:
-    """The array in a file of NumPy; a `ValueError` that names the argument for another file."""
-    try:
-        return np.load(file, allow_pickle=False)
+        content = np.load(file, allow_pickle=of_cellpose)
     except (ValueError, EOFError, OSError) as error:
         raise ValueError(
             f"Argument `{name}` must name a file of `numpy.save` with an array of numbers, but {file} cannot "
             "be read as one."
         ) from error
+    if not of_cellpose:
+        return content
+    content = content.item() if content.dtype == object and content.ndim == 0 else {}
+    if not isinstance(content, dict) or "masks" not in content:
+        raise ValueError(f"{file} must hold `masks`, as Cellpose saves them, but does not.")
+    return np.asarray(content["masks"])
 
 
 def _numbered(pixels: Shaped[np.ndarray, "..."]) -> Int[np.ndarray, "rows columns"]:
@@ -297,9 +287,9 @@ def _between(lines: Bool[np.ndarray, "rows columns"]) -> _Outlined | int:
     if len(cells) < 2:
         return len(cells)
     line = ~np.isin(regions, cells)
-    distance = np.asarray(distance_transform_edt(line))
-    nearest = distance_transform_edt(line, return_distances=False, return_indices=True)
-    regions = regions[tuple(np.asarray(nearest))]
+    transform: Any = distance_transform_edt(line, return_indices=True)
+    distance, nearest = transform
+    regions = regions[tuple(nearest)]
     half_width = _half_width(regions, distance)
     # What is farther from all cells than any point of a line, junctions included, is no line.
     regions[distance > 2 * half_width + 1] = 0

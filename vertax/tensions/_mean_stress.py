@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
+from scipy.sparse import coo_array, csr_array
 
 from vertax.mesh import Tissue, geometry_of
 
@@ -50,29 +51,20 @@ def fabric(tissue: Tissue) -> Float[np.ndarray, "edges 2 2"]:
     return length[:, None, None] * mean
 
 
-def stress_weights(
-    tissue: Tissue,
-    edges: Int[np.ndarray, " tensions"],
-    cells: Int[np.ndarray, " pressures"],
-    tangents: Float[np.ndarray, "edges 2 2"],
-    areas: Float[np.ndarray, " cells"],
-) -> tuple[Float[np.ndarray, "3 unknowns"], Bool[np.ndarray, " cells"]]:
-    """Mean stress xx, xy and yy per unit of each tension and pressure, and the cells in the mean.
+def stress_operators(
+    tissue: Tissue, tangents: Float[np.ndarray, "edges 2 2"], areas: Float[np.ndarray, " cells"]
+) -> list[csr_array]:
+    """Matrices of the stresses xx, xy and yy of cells times their areas, by all tensions and pressures.
 
     `tangents` are the integrals of t t over the edges, see `fabric`.
     """
-    geometry = geometry_of(tissue)
-    missing = np.full(tissue.n_edges, True)
-    missing[edges] = False
-    included = np.isin(np.arange(tissue.n_cells), cells)
-    included = np.append(included, False)
-    included[geometry.edge_cells[missing].ravel()] = False
-    area = np.where(included[:-1], areas, 0.0)
-    total = max(float(np.sum(area)), 1e-300)
-    half = 0.5 * included[geometry.edge_cells].sum(axis=1)
-    pull = (half[:, None, None] * tangents)[edges].reshape(-1, 4)[:, [0, 1, 3]].T
-    push = -np.outer([1, 0, 1], area[cells])
-    return np.concatenate([pull, push], axis=1) / total, included[:-1]
+    beside = geometry_of(tissue).edge_cells
+    edge, side = np.nonzero(beside < tissue.n_cells)
+    cell, cells = beside[edge, side], np.arange(tissue.n_cells)
+    row, column = np.append(cell, cells), np.append(edge, tissue.n_edges + cells)
+    shape = tissue.n_cells, tissue.n_edges + tissue.n_cells
+    pulls = [(0.5 * tangents[edge, i, j], -(i == j) * areas) for i, j in ((0, 0), (0, 1), (1, 1))]
+    return [csr_array(coo_array((np.append(*x), (row, column)), shape=shape)) for x in pulls]
 
 
 def mean_stress(

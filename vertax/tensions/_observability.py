@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
+from scipy.sparse import bsr_array, coo_array, csc_array, csr_array, diags_array
 
 from vertax._base.sparse_normal import SparseNormal, spread_parts
-from vertax.tensions._balance import Equations, angle_slopes, angles, lifted_slopes, pulls
+from vertax.tensions._balance import Equations, angle_slopes, angles, pulls
 from vertax.tensions._curves import Fitted
 from vertax.tensions._errors import Errors
 from vertax.tensions._observed_geometry import ObservedGeometry
@@ -147,7 +147,8 @@ def observability(
     indices = np.arange(n), np.arange(n + 1)
     follow = -csr_array(bsr_array((blocks, *indices)) @ through)
     vertices = csc_array(precision[coordinates][:, coordinates] + through.T @ follow)
-    slopes: Any = angle_slopes(fitted, which)
+    angle, lifted = angles(fitted, which)
+    slopes: Any = csr_array(diags_array(lifted) @ angle_slopes(fitted, which))
     slopes = csr_array(slopes[:, coordinates] + slopes[:, inner] @ follow)
     forward = fitted.forward[which.junctions].ravel()
     arcs = np.arange(which.n_arcs)
@@ -156,7 +157,7 @@ def observability(
     edge_covariance = np.zeros((n, 3, 3))
     if which.lever is None:
         factor = np.ones((n, 3))
-        factor[edge, slot] = lifted_slopes(fitted, which)
+        factor[edge, slot] = lifted
         ends = factor[:, :, None] * _ENDS
         edge_covariance = ends @ blocks @ np.swapaxes(ends, 1, 2)
 
@@ -188,7 +189,7 @@ def observability(
     if prior is None:
         bounds |= {"tension": _ARC_TENSIONS if which.n_arcs else _TENSIONS, "region": _TENSIONS}
     return Observability(
-        angle=angles(fitted, which),
+        angle=angle,
         edge=edge,
         slot=slot,
         vertices=vertices,

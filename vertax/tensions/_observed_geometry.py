@@ -60,7 +60,6 @@ class ObservedGeometry(NamedTuple):
     part of its two ends."""
     place: Float[np.ndarray, "vertices 2"]
     """Positions of the vertices in the tissue, which distinguish neighbours from distant ones; not moved."""
-    n_cells: int
     inner: Bool[np.ndarray, " vertices"]
     """Vertices where three cells meet and forces balance."""
     size: float
@@ -123,7 +122,6 @@ def observed_geometry(
         angle=geometry.edge_angles,
         bend=np.zeros((tissue.n_edges, 2)),
         place=np.asarray(tissue.vertices, float),
-        n_cells=tissue.n_cells,
         inner=inner,
         size=float(np.sqrt(np.mean(np.abs(geometry.areas[: tissue.n_cells][is_cell[:-1]])))),
     )

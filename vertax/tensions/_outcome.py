@@ -9,15 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vertax._base.pixels import PixelSize, pixel_length
-from vertax.initialise import MaskReport
 from vertax.mesh import Tissue, angle_of_area, geometry_of
 from vertax.surfaces import AbstractSurface
 from vertax.tensions._balance import Equations
 from vertax.tensions._curves import Fitted, Points, arc_distances
-from vertax.tensions._inferred import CurvedGeometry, InferredTensions
-from vertax.tensions._lift import SurfaceMeasures, measured
-from vertax.tensions._mean_stress import fabric, mean_stress, stress_weights
+from vertax.tensions._inferred import InferredTensions
+from vertax.tensions._lift import curved_geometry
+from vertax.tensions._mean_stress import fabric, mean_stress, stress_operators
 from vertax.tensions._solve import HIDDEN, Balance
 
 # A tension with a larger standard deviation, relative to the mean, is not determined.
@@ -73,55 +71,6 @@ def is_determined(deviation: Float[np.ndarray, " tensions"]) -> Bool[np.ndarray,
     return deviation < _UNKNOWN
 
 
-def outcome(
-    tissue: Tissue,
-    points: Points,
-    curves: Fitted,
-    which: Equations,
-    balance: Balance,
-    source: tuple[
-        Int[np.ndarray, " cells"], PixelSize | None, Bool[np.ndarray, " edges"], MaskReport | None
-    ],
-    surface: AbstractSurface | None = None,
-) -> InferredTensions:
-    """The result as it is reported.
-
-    **Arguments:**
-
-    - `tissue`: the observed tissue.
-    - `points`: the points of all edges.
-    - `curves`: its fitted edges.
-    - `which`, `balance`: the equations and their solution.
-    - `source`: labels of the cells, size of a pixel, edges of length 0, and the report on the mask.
-    - `surface`: the surface of the tissue; None in the plane.
-
-    **Returns:** the [`InferredTensions`][vertax.tensions.InferredTensions].
-    """
-    labels, pixel_size, four_fold, report = source
-    tissue = _moved(tissue, curves.change)
-    if report is not None:
-        tissue = _with_outline_of_mask(tissue, points, curves.change, which.edges)
-    return assembled(
-        tissue,
-        (which.edges, which.cells),
-        relative(balance, which, curves),
-        balance.posterior.covariances,
-        four_fold=four_fold,
-        surface=surface,
-        labels=np.asarray(labels),
-        noise=float(curves.noise * balance.errors.noise),
-        correlation=float(curves.apart),
-        bending=curves.bending,
-        edges="straight" if which.n_arcs == 0 else "arcs",
-        errors={name: float(value) for name, value in balance.errors._asdict().items()},
-        pixel_size=pixel_size,
-        mask_report=report,
-        short=_spread(tissue.n_edges, which.edges, balance.loose, False),
-        outline_errors=_outline_errors(tissue, points, curves.change)
-        / pixel_length(pixel_size or 1.0),
-    )
-
-
 def assembled(
     tissue: Tissue,
     places: tuple[Int[np.ndarray, " tensions"], Int[np.ndarray, " pressures"]],
@@ -148,21 +97,29 @@ def assembled(
     """
     tangents, areas = fabric(tissue), geometry_of(tissue).areas
     curved = None
+    of_edges = lambda of, fill: spread(tissue.n_edges, places[0], of, fill)
+    of_cells = lambda of, fill: spread(tissue.n_cells, places[1], of, fill)
+    tensions, pressures = of_edges(values.tension, np.nan), of_cells(values.pressure, np.nan)
     if surface is not None:
-        measures = measured(tissue, surface)
-        tangents, areas = measures.fabric, measures.areas
-        of_edges = _spread(tissue.n_edges, places[0], values.tension, np.nan)
-        curved = _curved(tissue, of_edges, surface, measures)
-    weights, included = stress_weights(tissue, *places, tangents, areas)
+        curved, tangents = curved_geometry(tissue, surface, tensions)
+        areas = curved.areas
+    operators = stress_operators(tissue, tangents, areas)
+    # The mean is that of the cells with a pressure and tensions of all their edges.
+    missing = ~spread(tissue.n_edges, places[0], True, False)
+    included = spread(tissue.n_cells + 1, places[1], True, False)
+    included[geometry_of(tissue).edge_cells[missing]] = False
+    included = included[:-1]
+    columns = np.concatenate([places[0], tissue.n_edges + places[1]])
+    total = max(float(np.sum(areas[included])), 1e-300)
+    weights = np.stack([included @ operator for operator in operators])[:, columns] / total
     components = weights @ np.concatenate([values.tension, values.pressure])
     # Pressures are less their mean.
     n, lag = len(values.tension), weights @ values.lag
     weights[:, n:] -= weights[:, n:].mean(axis=1, keepdims=True)
     covariance = weights @ covariances(weights.T) + np.outer(lag, lag)
-    of_edges = lambda of, fill: _spread(tissue.n_edges, places[0], of, fill)
-    of_cells = lambda of, fill: _spread(tissue.n_cells, places[1], of, fill)
-    tensions, pressures = of_edges(values.tension, np.nan), of_cells(values.pressure, np.nan)
     determined = of_edges(values.sure, False) & ~four_fold
+    certain = np.append(np.where(determined, tensions, np.nan), pressures)
+    stresses = np.stack([operator @ certain / areas for operator in operators], axis=1)
     return InferredTensions(
         tissue=tissue,
         tensions=tensions,
@@ -171,7 +128,7 @@ def assembled(
         pressures=pressures,
         pressure_deviations=of_cells(values.pressure_deviation, np.nan),
         pressures_determined=of_cells(values.beside, False),
-        stresses=_stresses(tissue, tensions, pressures, determined, tangents, areas),
+        stresses=stresses[:, [[0, 1], [1, 2]]],
         mean_stress=mean_stress(components, covariance, int(included.sum())),
         four_fold=four_fold,
         curved=curved,
@@ -179,36 +136,14 @@ def assembled(
     )
 
 
-def _curved(
-    tissue: Tissue,
-    tensions: Float[np.ndarray, " edges"],
-    surface: AbstractSurface,
-    measures: SurfaceMeasures,
-) -> CurvedGeometry:
-    """The geometry on a surface, and the normal loads of tensions."""
-    m = tissue.topology
-    half = 0.5 * tensions * measures.bending
-    perimeters = np.zeros(tissue.n_cells + 1)
-    for side in np.asarray(m.edge_cells).T:
-        np.add.at(perimeters, side, measures.lengths)
-    return CurvedGeometry(
-        tissue=Tissue(tissue.vertices, m, tissue.boundary, tissue.softening, surface=surface),
-        areas=measures.areas,
-        perimeters=perimeters[:-1],
-        slopes=measures.slopes,
-        lengths=measures.lengths,
-        normal_loads=half[np.asarray(m.edge).reshape(-1, 3)].sum(axis=1),
-    )
-
-
-def _spread(size: int, place: Int[np.ndarray, " some"], of: np.ndarray, fill: Any) -> np.ndarray:
+def spread(size: int, place: Int[np.ndarray, " some"], of: Any, fill: Any) -> np.ndarray:
     """An array with values at some places."""
     array = np.full(size, fill)
     array[place] = of
     return array
 
 
-def _outline_errors(
+def outline_errors(
     tissue: Tissue, points: Points, change: Float[np.ndarray, " geometry"]
 ) -> Float[np.ndarray, " cells"]:
     """Root mean square distance of the points around each cell from its arcs."""
@@ -230,7 +165,7 @@ def _from_moved_vertices(
     return points.away - shift[geometry_of(tissue).edge_vertices[points.edge, 0]]
 
 
-def _with_outline_of_mask(
+def with_outline_of_mask(
     tissue: Tissue,
     points: Points,
     change: Float[np.ndarray, " geometry"],
@@ -256,7 +191,7 @@ def _with_outline_of_mask(
     return tissue.with_angles(jnp.asarray(angles, tissue.vertices.dtype))
 
 
-def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
+def moved_by_fit(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     """The tissue with the vertices and angles of the fit."""
     n = 2 * tissue.n_vertices
     dtype = tissue.vertices.dtype
@@ -267,22 +202,3 @@ def _moved(tissue: Tissue, change: Float[np.ndarray, " geometry"]) -> Tissue:
     if tissue.arcs is None:
         return moved
     return moved.with_angles(jnp.asarray(angles, dtype))
-
-
-def _stresses(
-    tissue: Tissue,
-    tensions: Float[np.ndarray, " edges"],
-    pressures: Float[np.ndarray, " cells"],
-    determined: Bool[np.ndarray, " edges"],
-    tangents: Float[np.ndarray, "edges 2 2"],
-    areas: Float[np.ndarray, " cells"],
-) -> Float[np.ndarray, "cells 2 2"]:
-    """Stress of each cell, ½ Σ γ ∫ t t dl / A - p I over its edges (Batchelor 1970,
-    doi:10.1017/S0022112070000745)."""
-    geometry = geometry_of(tissue)
-    certain = np.where(determined, tensions, np.nan)
-    pulled = 0.5 * certain[:, None, None] * tangents
-    total = np.zeros((tissue.n_cells + 1, 2, 2))
-    for side in geometry.edge_cells.T:
-        np.add.at(total, side, pulled)
-    return total[:-1] / areas[:, None, None] - pressures[:, None, None] * np.eye(2)

@@ -23,6 +23,7 @@ from vertax._base.announce import announce_compilations
 from vertax._base.atomic import atomic_write
 from vertax._base.blas import one_blas_thread
 from vertax._base.checkpoints import digest as arrays_digest
+from vertax._base.checks import check_choice
 from vertax._base.pixels import pixel_length, pixel_sides
 from vertax._base.tasks import map_tasks
 from vertax._base.threads import num_threads
@@ -108,8 +109,7 @@ class TensionsOfMasks(eqx.Module):
         - `ValueError` for another format.
         - `ImportError` for Parquet files if PyArrow is not installed: `pip install -e ".[cluster]"`.
         """
-        if format not in ("csv", "parquet"):
-            raise ValueError(f'Argument `format` must be "csv" or "parquet", but is {format!r}.')
+        check_choice("format", format, ("csv", "parquet"))
         ending = ".csv" if format == "csv" else ""
         paths = {name: Path(folder) / f"{name}{ending}" for name in _TABLES}
         columns = Path(folder) / "columns.csv"
