@@ -189,12 +189,10 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
         box is sheared or its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
     check_single(tissue)
-    check_planar("tables, which have two coordinates (save_tissue keeps the surface)", tissue)
+    check_planar("tables, which have two coordinates (save keeps the surface)", tissue)
     tissue = tissue.without_spare()
     if tissue.inner_arcs:
-        raise ValueError(
-            "Tables hold arcs on the outline only. Use `save_tissue`, which keeps all."
-        )
+        raise ValueError("Tables hold arcs on the outline only. Use `vx.save`, which keeps all.")
     boundary = tissue.boundary
     if isinstance(boundary, Free):
         angles = np.asarray(tissue.edge_angles if tissue.angles is None else tissue.angles)
@@ -208,7 +206,7 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
     if lattice[0, 1] != 0 or lattice[1, 0] != 0:
         raise ValueError(
             "Tables hold rectangular boxes only (lattice vectors along x and y), but the lattice "
-            f"is {lattice.tolist()}. Use `save_tissue`, which keeps any lattice."
+            f"is {lattice.tolist()}. Use `vx.save`, which keeps any lattice."
         )
     size = np.diag(lattice)
     m = tissue.topology
