@@ -19,7 +19,7 @@ LINES = {
     "fitting": 2025,
     "growth": 825,
     "inference": 2295,
-    "initialise": 3913,
+    "initialise": 3876,
     "io": 3633,
     "jobs": 935,
     "mechanics": 2251,
