@@ -17,10 +17,10 @@ from vertax.initialise._gaps import (
     EXTERIOR,
     GAP,
     default_gap_width,
-    distance_within,
     fill_gaps,
     largest_cluster,
     line_width,
+    nearest_outside,
     with_exterior,
 )
 from vertax.initialise._heights import surface_of
@@ -337,7 +337,8 @@ def _segmentation(
     if not periodic:
         complete &= ~np.logical_or(*_touching(home, n))[label]
     # Pixels of a face other than the one of their label.
-    depth = distance_within(faces.parent[home] != given, options.spacing, periodic=periodic)
+    changed = faces.parent[home] != given
+    depth, _ = nearest_outside(changed, options.spacing, periodic=periodic)
     # A free tissue has a margin of unchanged pixels; the box of the others repeats itself.
     box, room = depth, 2 * margin
     if options.boundary == "mirrored":
