@@ -337,8 +337,7 @@ def _segmentation(
     if not periodic:
         complete &= ~np.logical_or(*_touching(home, n))[label]
     # Pixels of a face other than the one of their label.
-    changed = faces.parent[home] != given
-    depth, _ = nearest_outside(changed, options.spacing, periodic=periodic)
+    depth, _ = nearest_outside(faces.parent[home] != given, options.spacing, periodic=periodic)
     # A free tissue has a margin of unchanged pixels; the box of the others repeats itself.
     box, room = depth, 2 * margin
     if options.boundary == "mirrored":
