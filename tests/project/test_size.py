@@ -19,7 +19,7 @@ LINES = {
     "fitting": 2025,
     "growth": 825,
     "inference": 2295,
-    "initialise": 3835,
+    "initialise": 3819,
     "io": 3628,
     "jobs": 935,
     "mechanics": 2251,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2296,
     "surfaces": 630,
     "tensions": 4355,
-    "tests": 31920,
+    "tests": 31911,
     "transitions": 1327,
 }
 # Largest number of lines of a file, and of the files that have more.
