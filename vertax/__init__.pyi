@@ -53,7 +53,7 @@ from .fitting import (
     fit as fit,
     uncertainty as uncertainty,
 )
-from .io import load_tissue as load_tissue, save_tissue as save_tissue
+from .io import load as load, save as save
 from .mesh import (
     AbstractBoundary as AbstractBoundary,
     Free as Free,

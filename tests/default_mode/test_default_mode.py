@@ -238,14 +238,14 @@ class TestDynamics:
 class TestInputAndOutput:
     def test_saved_tissue_is_the_same(self, rest, tmp_path):
         tissue, _ = rest
-        vx.save_tissue(tmp_path / "tissue.npz", tissue)
-        loaded = vx.load_tissue(tmp_path / "tissue.npz")
+        vx.save(tmp_path / "tissue.npz", tissue)
+        loaded = vx.load(tmp_path / "tissue.npz", vx.Tissue)
         assert loaded.vertices.dtype == jnp.float32
         np.testing.assert_array_equal(loaded.vertices, tissue.vertices)
 
     def test_saved_energy_is_the_same(self, rest, tmp_path):
-        vx.io.save_energy(tmp_path / "energy.npz", rest[1])
-        loaded = vx.io.load_energy(tmp_path / "energy.npz")
+        vx.save(tmp_path / "energy.npz", rest[1])
+        loaded = vx.load(tmp_path / "energy.npz", vx.AbstractEnergy)
         np.testing.assert_array_equal(loaded.target_shape_factor, TRUTH)
 
     def test_tables_return_the_same_tissue(self, rest):

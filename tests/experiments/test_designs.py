@@ -57,7 +57,7 @@ def test_mechanics_reaches_its_target(tmp_path, method):
     assert metrics["distance_final"] < 5e-3
     assert metrics["limited_by"] == "reached"
     assert metrics["max_force"] < 1e-9
-    tissue = vx.load_tissue(folder / "designed.npz")
+    tissue = vx.load(folder / "designed.npz", vx.Tissue)
     assert float(jnp.mean(tissue.shape_factors)) == pytest.approx(metrics["mean_final"])
     observed = np.array(table(folder / "cells.csv")["observed_final"], float)
     np.testing.assert_allclose(observed, tissue.shape_factors)
@@ -77,7 +77,7 @@ def test_a_cluster_elongates(tmp_path, method):
     assert np.allclose(ratios, 1.6, atol=0.1)
     rows = table(folder / "aspect_ratios.csv")
     np.testing.assert_allclose(np.array(rows["aspect_ratio"], float), ratios)
-    first = vx.load_tissue(folder / "designed.npz")
+    first = vx.load(folder / "designed.npz", vx.Tissue)
     assert float(aspect_ratio(first)) == pytest.approx(ratios[0])
     assert six["max_force"] < 1e-9
     curve = np.array(table(folder / "history.csv")["aspect_ratio"], float).reshape(2, 15)
@@ -98,7 +98,7 @@ def test_interfaces_between_cells_of_one_type_shrink(tmp_path, method):
     kind = metrics["free, 2 types"]
     assert kind["share_best"]["mean"] > kind["share_initial"]["mean"] + 0.1
     types = jnp.asarray(np.array(table(folder / "cell_types.csv")["type"], int))
-    tissue = vx.load_tissue(folder / "designed.npz")
+    tissue = vx.load(folder / "designed.npz", vx.Tissue)
     shares = np.array(table(folder / "history.csv")["heterotypic_share"], float).reshape(2, 8)
     left = HomotypicLength(types, relative=True)(tissue, vx.energies.LineTension(1.0))
     assert 1 - float(left) == pytest.approx(shares[0, kind["best_epoch"][0]])

@@ -50,7 +50,7 @@ def test_the_fitted_mesh_follows_the_membranes_better(picture, tmp_path, pytestc
     assert np.mean(factors) == pytest.approx(metrics["shape_factor_mean"])
     assert all(0 < float(row["x_pixels"]) < 160 for row in rows)
     # The correlation is that of the pictures of the saved tissues with the saved image.
-    fitted = vx.load_tissue(tmp_path / "run" / "fitted.npz")
+    fitted = vx.load(tmp_path / "run" / "fitted.npz", vx.Tissue)
     image = np.load(tmp_path / "run" / "image.npy")
     width = metrics["psf_width_pixels"] * metrics["pixel_size"]
     mirrored = vx.costs.mirror(image)

@@ -65,7 +65,7 @@ def test_metrics_agree_with_the_saved_tissues(tiny, source):
     folder, metrics = tiny
     shape_factors = {k: np.array(v, float) for k, v in table(folder / "shape_factors.csv").items()}
     true, inferred = shape_factors["true"], shape_factors[f"inferred_{source}"]
-    fitted = vx.load_tissue(folder / f"fitted_{source}.npz")
+    fitted = vx.load(folder / f"fitted_{source}.npz", vx.Tissue)
     energy = vx.energies.ShapeFactorEnergy(inferred)
     force = eqx.filter_jit(jax.grad(lambda x: energy(fitted.with_configuration(x))))(
         fitted.configuration
@@ -81,7 +81,7 @@ def test_metrics_agree_with_the_saved_tissues(tiny, source):
     assert reported["seconds_per_epoch"] > 0
     assert reported["converged_fraction"] == 1
     if source == "vertices":
-        cost = vx.costs.VertexDistance(vx.load_tissue(folder / "target.npz"))
+        cost = vx.costs.VertexDistance(vx.load(folder / "target.npz", vx.Tissue))
         assert float(cost(fitted, energy)) == pytest.approx(reported["cost_final"])
     else:
         width = 2.0 * np.sqrt(6) / 48
@@ -92,7 +92,7 @@ def test_metrics_agree_with_the_saved_tissues(tiny, source):
 def test_the_target_is_an_equilibrium_of_the_true_parameters(tiny):
     folder, _ = tiny
     true = np.array(table(folder / "shape_factors.csv")["true"], float)
-    target = vx.load_tissue(folder / "target.npz")
+    target = vx.load(folder / "target.npz", vx.Tissue)
     # The settings of the experiment: then nothing is compiled again.
     relaxation = load_config(folder / "config.toml")[1].relaxation.build()
     equilibrium = relaxation(

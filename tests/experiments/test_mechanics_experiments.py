@@ -138,6 +138,6 @@ def test_a_box_is_extended(tmp_path):
     folder, metrics = run(tmp_path / "tiny.toml", tmp_path / "out")
     (ratio,) = metrics["9 cells"]["targets"]["1.15"]["ratios"]
     assert ratio == pytest.approx(1.15, abs=0.03)
-    tissue = vx.load_tissue(folder / "designed.npz")
+    tissue = vx.load(folder / "designed.npz", vx.Tissue)
     assert float(aspect_ratio(tissue, "box")) == pytest.approx(ratio)
     assert float(tissue.boundary.area) == pytest.approx(9)

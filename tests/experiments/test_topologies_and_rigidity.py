@@ -46,7 +46,7 @@ def test_guidance_crosses_topologies(tmp_path):
     assert guided["mismatched_neighbours"] == [0, 0]
     assert guided["relative_error_most"] < 1e-3
     assert guided["succeeded"] == 1
-    target, fitted = (vx.load_tissue(folder / f"{n}.npz") for n in ("target", "fitted_guided"))
+    target, fitted = (vx.load(folder / f"{n}.npz", vx.Tissue) for n in ("target", "fitted_guided"))
     assert mismatched_neighbours(fitted, target) == 0
     rows = table(folder / "shape_factors.csv")
     error = np.abs(np.array(rows["guided"], float) / np.array(rows["true"], float) - 1)

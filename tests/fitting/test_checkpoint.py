@@ -278,7 +278,7 @@ def test_checkpoint_in_a_missing_folder_is_rejected(path):
 
 
 def test_files_of_another_format_are_rejected(path):
-    vx.save_tissue(path, PROBLEM.tissue)
+    vx.save(path, PROBLEM.tissue)
     with pytest.raises(ValueError, match=r"is not a vertax checkpoint file.*Delete the file"):
         run("adam", 3, checkpoint=path)
 

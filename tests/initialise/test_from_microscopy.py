@@ -14,7 +14,6 @@ from scipy.spatial import KDTree
 
 from vertax import Periodic
 from vertax.initialise import (
-    AbstractSegmenter,
     Cellpose,
     Watershed,
     from_labels,
@@ -125,18 +124,9 @@ def test_mirrored_by_default_and_options_are_passed_on(small):
     assert 5 < got.complete.sum() < 25
 
 
-class Fixed(AbstractSegmenter):
-    """Returns fixed labels."""
-
-    labels: np.ndarray
-
-    def __call__(self, image):
-        return self.labels
-
-
 def test_a_custom_segmenter(small):
     image, truth = small
-    got = from_microscopy(image, segmenter=Fixed(truth), softening=0.0)
+    got = from_microscopy(image, segmenter=lambda _: truth, softening=0.0)
     want = from_labels(truth, softening=0.0)
     assert np.array_equal(got.labels, want.labels)
     np.testing.assert_array_equal(got.tissue.vertices, want.tissue.vertices)
@@ -146,21 +136,26 @@ def test_a_custom_segmenter(small):
     "labels", [np.ones((200, 200)), np.ones((3, 3), int), np.ones((200, 200, 1), int)]
 )
 def test_a_segmenter_must_return_integer_labels(small, labels):
-    with pytest.raises(ValueError, match=r"Argument `segmenter` must .* Fixed returned"):
-        from_microscopy(small[0], segmenter=Fixed(labels))
+    with pytest.raises(ValueError, match=r"Argument `segmenter` must .* <lambda> returned"):
+        from_microscopy(small[0], segmenter=lambda _: labels)
 
 
 def test_error_for_unusable_labels_names_the_segmenter(small):
     labels = np.repeat(np.arange(1, 5), 50)[:, None] + np.zeros((200, 200), int)
-    message = r"The labels that Fixed found in `image` make no tissue\..* the labels 1, 2, 3, 4 do"
+    message = (
+        r"The labels that <lambda> found in `image` make no tissue\..* the labels 1, 2, 3, 4 do"
+    )
     with pytest.raises(ValueError, match=message):
-        from_microscopy(small[0], segmenter=Fixed(labels))
+        from_microscopy(small[0], segmenter=lambda _: labels)
 
 
 @pytest.mark.parametrize("value", [0, 1])
 def test_fewer_than_two_cells_found(small, value):
-    with pytest.raises(ValueError, match=f"at least two cells, but Fixed found {value}"):
-        from_microscopy(small[0], segmenter=Fixed(np.full((200, 200), value)))
+    def fixed(_):
+        return np.full((200, 200), value)
+
+    with pytest.raises(ValueError, match=f"at least two cells, but fixed found {value}"):
+        from_microscopy(small[0], segmenter=fixed)
 
 
 @pytest.mark.parametrize(

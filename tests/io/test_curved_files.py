@@ -44,13 +44,13 @@ def on_cap():
 )
 def test_surfaces_are_loaded_as_they_were_saved(flat, make, tmp_path):
     tissue = make(flat)
-    vx.save_tissue(tmp_path / "tissue.npz", tissue)
-    assert eqx.tree_equal(vx.load_tissue(tmp_path / "tissue.npz"), tissue)
+    vx.save(tmp_path / "tissue.npz", tissue)
+    assert eqx.tree_equal(vx.load(tmp_path / "tissue.npz", vx.Tissue), tissue)
     trajectory = vx.mesh.Trajectory()
     for _ in range(2):
         trajectory.append(tissue, time=0.0)
-    vx.io.save_trajectory(tmp_path / "run.npz", trajectory)
-    for frame in vx.io.load_trajectory(tmp_path / "run.npz"):
+    vx.save(tmp_path / "run.npz", trajectory)
+    for frame in vx.load(tmp_path / "run.npz", vx.mesh.Trajectory):
         assert eqx.tree_equal(frame, tissue)
 
 
@@ -58,26 +58,28 @@ def test_a_trajectory_may_have_several_surfaces(flat, tmp_path):
     trajectory = vx.mesh.Trajectory()
     for height in (1.0, 2.0):
         trajectory.append(flat.with_surface(HeightMap(height * HEIGHTS, SIDE / 6, periodic=True)))
-    vx.io.save_trajectory(tmp_path / "run.npz", trajectory)
-    for loaded, frame in zip(vx.io.load_trajectory(tmp_path / "run.npz"), trajectory, strict=True):
+    vx.save(tmp_path / "run.npz", trajectory)
+    for loaded, frame in zip(
+        vx.load(tmp_path / "run.npz", vx.mesh.Trajectory), trajectory, strict=True
+    ):
         assert eqx.tree_equal(loaded, frame)
 
 
 def test_problems_keep_the_surface_of_their_tissue(tube, tmp_path):
     energy = vx.energies.ShapeFactorEnergy(3.7)
     problem = vx.InverseProblem(tube, energy, vx.costs.MeanShapeFactor(3.8))
-    vx.io.save_problem(tmp_path / "problem.npz", problem)
-    loaded = vx.io.load_problem(tmp_path / "problem.npz")
+    vx.save(tmp_path / "problem.npz", problem)
+    loaded = vx.load(tmp_path / "problem.npz", vx.InverseProblem)
     assert eqx.tree_equal(loaded.tissue.surface, tube.surface)
 
 
 def test_a_function_has_no_place_in_a_file(flat, tmp_path):
     with pytest.raises(ValueError, match=r"`surface\.function` is of type"):
-        vx.save_tissue(tmp_path / "tissue.npz", flat.with_surface(Graph(lambda x: 0 * x[0])))
+        vx.save(tmp_path / "tissue.npz", flat.with_surface(Graph(lambda x: 0 * x[0])))
 
 
 def test_a_broken_surface_is_rejected(tube, tmp_path):
-    vx.save_tissue(tmp_path / "tissue.npz", tube)
+    vx.save(tmp_path / "tissue.npz", tube)
     arrays = dict(np.load(tmp_path / "tissue.npz"))
     for changes, message in (
         ({"data.surface.radius": np.ones(2)}, "surface"),
@@ -85,7 +87,7 @@ def test_a_broken_surface_is_rejected(tube, tmp_path):
     ):
         np.savez(tmp_path / "broken.npz", allow_pickle=False, **(arrays | changes))
         with pytest.raises(ValueError, match=message):
-            vx.load_tissue(tmp_path / "broken.npz")
+            vx.load(tmp_path / "broken.npz", vx.Tissue)
 
 
 def test_vtk_files_have_the_points_in_space(tube, tmp_path):

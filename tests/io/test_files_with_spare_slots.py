@@ -19,13 +19,13 @@ def tissue():
 
 
 def test_files_keep_spare_slots_exactly(tissue, tmp_path):
-    vx.save_tissue(tmp_path / "tissue.npz", tissue)
-    assert eqx.tree_equal(vx.load_tissue(tmp_path / "tissue.npz"), tissue)
+    vx.save(tmp_path / "tissue.npz", tissue)
+    assert eqx.tree_equal(vx.load(tmp_path / "tissue.npz", vx.Tissue), tissue)
     trajectory = vx.mesh.Trajectory()
     for frame in (random_tissue(6, 3).with_capacity(9), tissue):
         trajectory.append(frame, time=0.0)
-    vx.io.save_trajectory(tmp_path / "movie.npz", trajectory)
-    assert eqx.tree_equal(vx.io.load_trajectory(tmp_path / "movie.npz")[1], tissue)
+    vx.save(tmp_path / "movie.npz", trajectory)
+    assert eqx.tree_equal(vx.load(tmp_path / "movie.npz", vx.mesh.Trajectory)[1], tissue)
 
 
 def test_tables_omit_spare_slots(tissue, tmp_path):

@@ -13,7 +13,7 @@ from helpers import random_tissue, rewritten
 
 import vertax as vx
 from vertax._base.atomic import atomic_write
-from vertax.io import load_tissue, save_tissue
+from vertax.io import load, save
 from vertax.transitions._euler_operators import flip_edges
 
 
@@ -30,7 +30,7 @@ def tissue():
 @pytest.fixture
 def saved(tissue, tmp_path):
     path = tmp_path / "tissue.npz"
-    save_tissue(path, tissue)
+    save(path, tissue)
     return path
 
 
@@ -43,18 +43,18 @@ def same_bits(a, b):
 
 class TestRoundTrip:
     def test_every_bit(self, tissue, saved):
-        assert same_bits(load_tissue(saved), tissue)
+        assert same_bits(load(saved, vx.Tissue), tissue)
 
     def test_float32(self, tissue, tmp_path):
         single = jax.tree.map(
             lambda x: x.astype(np.float32) if eqx.is_inexact_array(x) else x, tissue
         )
-        save_tissue(tmp_path / "single", single)
-        loaded = load_tissue(tmp_path / "single")
+        save(tmp_path / "single", single)
+        loaded = load(tmp_path / "single", vx.Tissue)
         assert loaded.vertices.dtype == jnp.float32
         assert same_bits(loaded, single)
         with jax.enable_x64(False):
-            assert same_bits(load_tissue(tmp_path / "single"), single)
+            assert same_bits(load(tmp_path / "single", vx.Tissue), single)
 
     def test_after_a_transition(self, tissue, tmp_path):
         # After a flip the labels and directions of edges do not follow from their order.
@@ -64,62 +64,61 @@ class TestRoundTrip:
             flipped = flipped.with_topology(flip_edges(flipped.topology, flip))
         plain = vx.Topology(*jax.tree.leaves(flipped.topology)[:4])
         assert not same_bits(plain, flipped.topology)
-        save_tissue(tmp_path / "flipped.npz", flipped)
-        assert same_bits(load_tissue(tmp_path / "flipped.npz"), flipped)
+        save(tmp_path / "flipped.npz", flipped)
+        assert same_bits(load(tmp_path / "flipped.npz", vx.Tissue), flipped)
+
+    def test_a_batch(self, tissue, tmp_path):
+        batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
+        save(tmp_path / "batch.npz", batch)
+        assert same_bits(load(tmp_path / "batch.npz", vx.Tissue), batch)
 
     def test_negative_zero_and_no_softening(self, tissue, tmp_path):
         odd = vx.Tissue(tissue.vertices.at[0].set(-0.0), tissue.topology, tissue.boundary, 0.0)
-        save_tissue(tmp_path / "odd.npz", odd)
-        assert same_bits(load_tissue(tmp_path / "odd.npz"), odd)
+        save(tmp_path / "odd.npz", odd)
+        assert same_bits(load(tmp_path / "odd.npz", vx.Tissue), odd)
 
     def test_saving_again_replaces(self, tissue, saved):
         moved = tissue.with_configuration(tissue.vertices + 1)
-        save_tissue(saved, moved)
-        assert same_bits(load_tissue(saved), moved)
+        save(saved, moved)
+        assert same_bits(load(saved, vx.Tissue), moved)
         assert os.listdir(saved.parent) == [saved.name]
 
 
 class TestRefusedToSave:
-    def test_a_batch(self, tissue, tmp_path):
-        batch = jax.tree.map(lambda x: jnp.stack([x, x]), tissue)
-        with pytest.raises(ValueError, match="must be a single tissue"):
-            save_tissue(tmp_path / "batch.npz", batch)
-        assert os.listdir(tmp_path) == []
-
     def test_bfloat16(self, tissue, tmp_path):
         half = tissue.with_configuration(tissue.vertices.astype(jnp.bfloat16))
         with pytest.raises(ValueError, match="`vertices` is bfloat16"):
-            save_tissue(tmp_path / "half.npz", half)
+            save(tmp_path / "half.npz", half)
 
     def test_a_boundary_of_a_user_needs_its_class(self, tissue, tmp_path):
         class Box(vx.Periodic):
             """A box of a user."""
 
         odd = eqx.tree_at(lambda t: t.boundary, tissue, Box(tissue.boundary.lattice))
-        save_tissue(tmp_path / "box.npz", odd)
-        assert same_bits(load_tissue(tmp_path / "box.npz", classes=[Box]), odd)
+        save(tmp_path / "box.npz", odd)
+        assert same_bits(load(tmp_path / "box.npz", vx.Tissue, classes=[Box]), odd)
         with pytest.raises(ValueError, match=r"Pass the class: classes=\[Box\]"):
-            load_tissue(tmp_path / "box.npz")
+            load(tmp_path / "box.npz", vx.Tissue)
 
 
 class TestRefusedToLoad:
     def test_missing(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"nowhere\.npz"):
-            load_tissue(tmp_path / "nowhere.npz")
+            load(tmp_path / "nowhere.npz", vx.Tissue)
 
     def test_float64_without_x64(self, saved):
         with (
             jax.enable_x64(False),
             pytest.raises(ValueError, match=r"tissue\.npz.*jax_enable_x64"),
         ):
-            load_tissue(saved)
+            load(saved, vx.Tissue)
 
     @pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.999])
     def test_truncated(self, saved, kept):
         content = saved.read_bytes()
         saved.write_bytes(content[: int(kept * len(content))])
         with pytest.raises(ValueError, match=r"tissue\.npz is truncated or damaged"):
-            load_tissue(saved)
+            load(saved, vx.Tissue)
 
     def test_any_flipped_byte_is_found_or_harmless(self, tissue, saved):
         content = bytearray(saved.read_bytes())
@@ -130,7 +129,7 @@ class TestRefusedToLoad:
             damaged[position] ^= rng.integers(1, 256)
             saved.write_bytes(damaged)
             try:
-                loaded = load_tissue(saved)
+                loaded = load(saved, vx.Tissue)
             except ValueError as error:
                 refused += str(saved) in str(error)
             else:  # a byte of the archive that is not read (of a date, for example) may change
@@ -140,30 +139,30 @@ class TestRefusedToLoad:
 
     def test_not_an_archive(self, tmp_path):
         (tmp_path / "notes.txt").write_text("cells and vertices")
-        with pytest.raises(ValueError, match=r"notes\.txt is not a vertax tissue file"):
-            load_tissue(tmp_path / "notes.txt")
+        with pytest.raises(ValueError, match=r"notes\.txt is not a vertax data file"):
+            load(tmp_path / "notes.txt", vx.Tissue)
         np.save(tmp_path / "array.npy", np.arange(3))
-        with pytest.raises(ValueError, match=r"array\.npy is not a vertax tissue file"):
-            load_tissue(tmp_path / "array.npy")
+        with pytest.raises(ValueError, match=r"array\.npy is not a vertax data file"):
+            load(tmp_path / "array.npy", vx.Tissue)
 
     def test_foreign_archives(self, tmp_path):
         np.savez(tmp_path / "other.npz", vertices=np.zeros((4, 2)))
-        with pytest.raises(ValueError, match=r"other\.npz is not a vertax tissue file"):
-            load_tissue(tmp_path / "other.npz")
+        with pytest.raises(ValueError, match=r"other\.npz is not a vertax data file"):
+            load(tmp_path / "other.npz", vx.Tissue)
         with zipfile.ZipFile(tmp_path / "letters.zip", "w") as archive:
             archive.writestr("a.txt", "text")
-        with pytest.raises(ValueError, match=r"letters\.zip is not a vertax tissue file"):
-            load_tissue(tmp_path / "letters.zip")
+        with pytest.raises(ValueError, match=r"letters\.zip is not a vertax data file"):
+            load(tmp_path / "letters.zip", vx.Tissue)
 
     def test_pickles(self, saved):
         rewritten(saved, format=np.array([{"an": "object"}], dtype=object))
         with pytest.raises(ValueError, match=r"tissue\.npz.*allow_pickle=False"):
-            load_tissue(saved)
+            load(saved, vx.Tissue)
 
     def test_newer_version(self, saved):
         rewritten(saved, version=2)
         with pytest.raises(ValueError, match=r"tissue\.npz has version 2.*Update vertax"):
-            load_tissue(saved)
+            load(saved, vx.Tissue)
 
     @pytest.mark.parametrize(
         ("changes", "message"),
@@ -191,7 +190,7 @@ class TestRefusedToLoad:
         arrays = {f"data.{name}": value for name, value in changes.items() if name != "version"}
         rewritten(saved, **header, **arrays)
         with pytest.raises(ValueError, match=rf"tissue\.npz.*{message}"):
-            load_tissue(saved)
+            load(saved, vx.Tissue)
 
 
 class TestAtomicWrite:
@@ -268,10 +267,10 @@ class TestAtomicWrite:
 @pytest.mark.parametrize("value", [-1, 10**6, 2**31, 2**32, 2**62])
 def test_error_names_numbers_out_of_range(tmp_path, name, value):
     path, name = tmp_path / "tissue.npz", f"data.topology.{name}"
-    vx.io.save_tissue(path, random_tissue(5))
+    vx.save(path, random_tissue(5))
     with np.load(path) as archive:
         array = archive[name].astype(np.int64)
     array.flat[7] += value
     fitting = array.astype(np.int32) if abs(array).max() < 2**31 else array
     with pytest.raises(ValueError, match=r"tissue.npz is broken: .*(half-edge|twin|edge|int32)"):
-        vx.io.load_tissue(rewritten(path, **{name: fitting}))
+        vx.load(rewritten(path, **{name: fitting}), vx.Tissue)

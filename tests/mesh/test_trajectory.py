@@ -13,7 +13,7 @@ from free_helpers import cluster
 from helpers import ADAM, FIXED_TOPOLOGY, NO_CONTACT, random_tissue, rewritten
 
 import vertax as vx
-from vertax.io import load_trajectory, save_trajectory
+from vertax.io import load, save
 from vertax.mesh import Trajectory
 from vertax.relax import record_relaxation
 from vertax.transitions._euler_operators import flip_edges
@@ -225,8 +225,8 @@ class TestSequence:
 class TestFile:
     def test_round_trip_across_transitions(self, relaxation, path):
         *_, trajectory = relaxation
-        save_trajectory(path, trajectory)
-        loaded = load_trajectory(path)
+        save(path, trajectory)
+        loaded = load(path, vx.mesh.Trajectory)
         assert same(loaded, trajectory)
         for name, values in trajectory.values.items():
             np.testing.assert_array_equal(loaded.values[name], values)
@@ -256,69 +256,69 @@ class TestFile:
             topology = flip_edges(tissue.topology, flip) if k == 2 else tissue.topology
             tissue = tissue.with_vertices(tissue.vertices + 0.1).with_topology(topology)
             trajectory.append(tissue)
-        save_trajectory(path, trajectory)
-        assert same(load_trajectory(path), trajectory)
+        save(path, trajectory)
+        assert same(load(path, vx.mesh.Trajectory), trajectory)
         with jax.enable_x64(precision == "float64"):
-            assert same(load_trajectory(path), trajectory)
+            assert same(load(path, vx.mesh.Trajectory), trajectory)
 
     def test_frames_with_different_boxes(self, path):
         tissue, trajectory = random_tissue(3), Trajectory()
         for k in range(3):
             box = vx.Periodic(tissue.boundary.lattice * (1 + 0.1 * k))
             trajectory.append(eqx.tree_at(lambda t: t.boundary, tissue, box), stretch=0.1 * k)
-        save_trajectory(path, trajectory)
-        assert same(load_trajectory(path), trajectory)
+        save(path, trajectory)
+        assert same(load(path, vx.mesh.Trajectory), trajectory)
 
     def test_empty_trajectories_are_not_saved(self, path):
         with pytest.raises(ValueError, match="at least one frame"):
-            save_trajectory(path, Trajectory())
+            save(path, Trajectory())
         assert os.listdir(path.parent) == []
 
     @pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.999])
     def test_truncated_files_are_rejected(self, relaxation, path, kept):
-        save_trajectory(path, relaxation[-1])
+        save(path, relaxation[-1])
         content = path.read_bytes()
         path.write_bytes(content[: int(kept * len(content))])
         with pytest.raises(ValueError, match=r"trajectory\.npz is truncated or damaged"):
-            load_trajectory(path)
+            load(path, vx.mesh.Trajectory)
 
     def test_other_files_are_rejected(self, relaxation, path):
         with pytest.raises(FileNotFoundError):
-            load_trajectory(path)
-        vx.save_tissue(path, relaxation[0])
-        with pytest.raises(ValueError, match=r"trajectory\.npz is not a vertax trajectory file"):
-            load_trajectory(path)
-        save_trajectory(path, relaxation[-1])
-        with pytest.raises(ValueError, match=r"trajectory\.npz is not a vertax tissue file"):
-            vx.load_tissue(path)
+            load(path, vx.mesh.Trajectory)
+        vx.save(path, relaxation[0])
+        with pytest.raises(ValueError, match=r"`kind` must be .*trajectory\.npz, Tissue, or"):
+            load(path, vx.mesh.Trajectory)
+        save(path, relaxation[-1])
+        with pytest.raises(ValueError, match=r"`kind` must be .*trajectory\.npz, Trajectory, or"):
+            vx.load(path, vx.Tissue)
         with jax.enable_x64(False), pytest.raises(ValueError, match=r"trajectory.*jax_enable_x64"):
-            load_trajectory(path)
+            load(path, vx.mesh.Trajectory)
 
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"version": 2}, "has version 2 of the trajectory format.*Update vertax"),
+            ({"version": 2}, "has version 2 of the data format.*Update vertax"),
             ({"data.parts.0.vertices": np.zeros((2, 24, 2))}, "is broken"),
             ({"data.values.0": np.zeros(2)}, "is broken"),
             ({"data.parts.0.topology.twin": None}, "no array `data.parts.0.topology.twin`"),
         ],
     )
     def test_inconsistent_arrays_are_rejected(self, relaxation, path, changes, message):
-        save_trajectory(path, relaxation[-1])
+        save(path, relaxation[-1])
         rewritten(path, **changes)
         with pytest.raises(ValueError, match=rf"trajectory\.npz.*{message}"):
-            load_trajectory(path)
+            load(path, vx.mesh.Trajectory)
 
     def test_invalid_frames_are_rejected(self, relaxation, path):
         *_, trajectory = relaxation
-        save_trajectory(path, trajectory)
+        save(path, trajectory)
         with np.load(path) as archive:
             names = ("vertices", "topology.twin", "boundary.lattice")
             vertices, twin, lattice = (archive[f"data.parts.0.{name}"].copy() for name in names)
         vertices[-1, 3], twin[-1], lattice[-1] = np.nan, 0, -lattice[-1, ::-1]
         reasons = ("must be finite", "involution", "right-handed")
         for name, array, reason in zip(names, (vertices, twin, lattice), reasons, strict=True):
-            save_trajectory(path, trajectory)
+            save(path, trajectory)
             rewritten(path, **{f"data.parts.0.{name}": array})
             with pytest.raises(ValueError, match=rf"trajectory\.npz is broken: .*{reason}"):
-                load_trajectory(path)
+                load(path, vx.mesh.Trajectory)

@@ -61,7 +61,7 @@ def test_library_works_without_extras():
 import jax, optax, vertax as vx
 for package in (vx.adjoints, vx.costs, vx.energies, vx.fitting, vx.initialise, vx.io, vx.mesh, vx.solvers):
     assert package
-assert vx.fit and vx.equilibrate and vx.T1 and vx.load_tissue and vx.runs
+assert vx.fit and vx.equilibrate and vx.T1 and vx.load and vx.runs
 assert vx.initialise.hexagonal(2, 2).n_cells == 4
 for name in ("plot_tissue", "plotting", "bayes"):
     try:

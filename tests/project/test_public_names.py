@@ -12,8 +12,8 @@ Equilibrium EquilibriumPropagation Evaluation Evolution External Fit FitError Fr
 GradientOutcome History ImplicitDifferentiation InverseProblem MINRES Periodic RESULTS Record
 Relaxation T1 T2 Tissue Topology Uncertainty activities adjoints animate bayes costs dissipations
 dynamics enable_compilation_cache energies equilibrate evolve external
-fit fitting growth inference initialise io load_tissue map_tasks mechanics mesh plot_history plot_recovery
-plot_tissue plotting relax runs save_tissue signals solvers surfaces tensions transitions uncertainty
+fit fitting growth inference initialise io load map_tasks mechanics mesh plot_history plot_recovery
+plot_tissue plotting relax runs save signals solvers surfaces tensions transitions uncertainty
 """
 
 

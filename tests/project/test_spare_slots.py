@@ -284,7 +284,7 @@ ELSEWHERE = {
     "Sum InTurn": "loops over terms that have cases",
     "AbstractLocalEnergy": "the base class",
     "animate plot_tissues": "draw by plot_tissue",
-    "save_tissue": "keeps spare slots; tests/io/test_files_with_spare_slots.py",
+    "save": "keeps spare slots; tests/io/test_files_with_spare_slots.py",
     "plot_surface": "needs a surface; tests/io/test_curved_files.py",
     "External": "needs another program",
     "Microscope PinnedEnergy": "render and ShapeFactorEnergy with other arguments",

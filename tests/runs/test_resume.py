@@ -90,7 +90,7 @@ def test_a_resumed_run_has_the_same_numbers(finished, interrupt, tmp_path, epoch
     assert "kept so far: " in resumed.output
     assert tables(run) == tables(finished / "run")
     fitted, expected = (
-        vx.io.load_tissue(f / "fitted_image.npz").vertices for f in (run, finished / "run")
+        vx.load(f / "fitted_image.npz", vx.Tissue).vertices for f in (run, finished / "run")
     )
     np.testing.assert_array_equal(fitted, expected)
     assert not (run / "unfinished").exists()

@@ -83,7 +83,7 @@ def test_a_failed_fit_keeps_its_epochs(tmp_path):
     with pytest.raises(vx.FitError):
         folder.fit("a b", problem(), optimiser, 3, progress=False)
     assert (tmp_path / "history_a_b.csv").read_text().count("\n") == 4
-    assert vx.load_tissue(tmp_path / "fitted_a_b.npz").n_cells == 6
+    assert vx.load(tmp_path / "fitted_a_b.npz", vx.Tissue).n_cells == 6
     assert folder.warnings == []
     outcome = folder.fit("c", problem(), optimiser, 3, partial=True, progress=False)
     assert len(outcome.history.cost) == 3

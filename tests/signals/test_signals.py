@@ -322,8 +322,8 @@ class TestEvolution:
     @pytest.mark.thorough
     def test_concentrations_are_in_trajectories_and_files(self, tmp_path):
         movie = evolve(Signals(Turnover(0.5), [0.1, 0.2], initial=[1.0, 0.5]))
-        vx.io.save_trajectory(tmp_path / "movie.npz", movie.trajectory)
-        loaded = vx.io.load_trajectory(tmp_path / "movie.npz")
+        vx.save(tmp_path / "movie.npz", movie.trajectory)
+        loaded = vx.load(tmp_path / "movie.npz", vx.mesh.Trajectory)
         np.testing.assert_array_equal(loaded.values["signals"], movie.signals)
         vx.animate(movie.trajectory, tmp_path / "movie.gif", movie.signals[:, 0], dpi=40)
         table = vx.io.cell_table(movie.tissue, activator=movie.signals[-1, 0])

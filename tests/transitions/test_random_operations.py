@@ -10,7 +10,7 @@ from helpers import random_tissue
 from mesh_checks import check_tissue
 
 import vertax as vx
-from vertax.io import load_tissue, save_tissue
+from vertax.io import load, save
 from vertax.transitions import ablate, divide, remove
 
 # One capacity, so that tissues of the same kind share compiled functions.
@@ -123,8 +123,8 @@ class Player:
 
     def save(self):
         path = self.folder / "tissue.npz"
-        save_tissue(path, self.tissue)
-        loaded = load_tissue(path)
+        save(path, self.tissue)
+        loaded = load(path, vx.Tissue)
         assert eqx.tree_equal(loaded, self.tissue)
         return loaded
 

@@ -19,8 +19,8 @@ from vertax.energies import AbstractEnergy, ShapeFactorEnergy
 from vertax.fitting import Fit, InverseProblem, Uncertainty, uncertainty
 from vertax.inference._preparation import away_from_outline, best_psf_width, in_even_light
 from vertax.initialise import (
-    AbstractSegmenter,
     Segmentation,
+    Segmenter,
     Watershed,
     from_labels,
     from_microscopy,
@@ -158,7 +158,7 @@ class Micrograph(eqx.Module):
 def micrograph_problem(
     image: Float[np.ndarray, "rows columns"],
     *,
-    segmenter: AbstractSegmenter | None = None,
+    segmenter: Segmenter | None = None,
     target_shape_factor: float = 3.7,
     border: str = "mirrored",
     rest_areas: str = "fitted",
@@ -251,7 +251,7 @@ class _Read(NamedTuple):
 
 def _mirrored(
     image: Float[np.ndarray, "rows columns"],
-    segmenter: AbstractSegmenter,
+    segmenter: Segmenter,
     target_shape_factor: float,
     rest_areas: str,
     prepare: Callable[[float], np.ndarray],
@@ -274,7 +274,7 @@ def _mirrored(
 
 def _pinned(
     image: Float[np.ndarray, "rows columns"],
-    segmenter: AbstractSegmenter,
+    segmenter: Segmenter,
     target_shape_factor: float,
     pixel_size: float | None,
     prepare: Callable[[float], np.ndarray],

@@ -13,8 +13,8 @@ from vertax.initialise._polygons import (
 )
 from vertax.initialise._report import MaskChange as MaskChange, MaskReport as MaskReport
 from vertax.initialise._segmenters import (
-    AbstractSegmenter as AbstractSegmenter,
     Cellpose as Cellpose,
+    Segmenter as Segmenter,
     Watershed as Watershed,
 )
 from vertax.initialise._skeleton import labels_from_skeleton as labels_from_skeleton

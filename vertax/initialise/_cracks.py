@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from vertax.initialise._nearby_corners import cross
+from vertax.initialise._pieces import components
 from vertax.initialise._spatial_order import spatial_order
 
 # A *crack* is the side between two pixels of different cells; cracks join at the corners of pixels.
@@ -123,8 +123,8 @@ def enclosed_cells(graph: CrackGraph, exterior: int | None = None) -> dict[int, 
     """
     n_corners = len(graph.corner)
     cracks = np.flatnonzero(graph.present)
-    n_parts, part = _components(n_corners, cracks // 4, graph.target[cracks])
-    n_faces, face = _components(4 * n_corners, cracks, graph.following[cracks])
+    n_parts, part = components(n_corners, cracks // 4, graph.target[cracks])
+    n_faces, face = components(4 * n_corners, cracks, graph.following[cracks])
     face = face[cracks]
     # A connected graph cuts the torus into disks if and only if vertices - edges + faces is 0, and
     # no two disjoint graphs do. That part is the tissue; the others lie inside its cells.
@@ -154,7 +154,7 @@ def enclosed_cells(graph: CrackGraph, exterior: int | None = None) -> dict[int, 
     tissue = np.zeros(len(cells), bool)
     tissue[a[in_tissue]] = True
     inside = ~tissue[a] & ~tissue[b]
-    group = _components(len(cells), a[inside], b[inside])[1]
+    group = components(len(cells), a[inside], b[inside])[1]
     border = ~tissue[a] & tissue[b]
     host = np.zeros(len(cells), int)
     host[group[a[border]]] = cells[b[border]]
@@ -218,7 +218,7 @@ def build_mesh(graph: CrackGraph, priority: Int[np.ndarray, "corners 4"]) -> Mes
     # What leads from a crack to the end of its edge: the longest way is that of the first crack.
     steps = _follow(onwards, np.ones_like(step))[1][:, 0]
     ahead = way
-    swept += _cross(way, _STEP[last % 4])
+    swept += cross(way, _STEP[last % 4])
     way = way + _STEP[last % 4]
     bulge = np.zeros(len(crack))
     bulge[real] = 0.5 * swept[crack[real]]
@@ -264,18 +264,7 @@ def _follow(
         onwards = pointer[pointer]
         if np.array_equal(onwards, pointer):
             break
-        swept = swept + swept[pointer] + _cross(total, total[pointer])
+        swept = swept + swept[pointer] + cross(total, total[pointer])
         total = total + total[pointer]
         pointer = onwards
     return pointer, total, swept
-
-
-def _cross(p: Int[np.ndarray, "n 2"], q: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-
-
-def _components(
-    n: int, a: Int[np.ndarray, " links"], b: Int[np.ndarray, " links"]
-) -> tuple[int, Int[np.ndarray, " nodes"]]:
-    links = coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n))
-    return connected_components(links, directed=False)

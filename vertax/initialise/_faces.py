@@ -7,9 +7,8 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from vertax.initialise._pieces import components
 from vertax.mesh import Topology
 
 
@@ -311,7 +310,7 @@ def _check_pieces(
     names: Names,
 ) -> None:
     """Refuse cells in several pieces that do not touch."""
-    n_pieces, piece = _components(n_points, start, start[twin])
+    n_pieces, piece = components(n_points, start, start[twin])
     counts = np.bincount(piece[start], minlength=n_pieces)
     if np.count_nonzero(counts) <= 1:
         return
@@ -333,7 +332,7 @@ def _check_orbits(
     names: Names,
 ) -> None:
     """Refuse points that cells surround in several groups, and more than one outline."""
-    n_fans, fan = _components(len(start), np.arange(len(start)), turned)
+    n_fans, fan = components(len(start), np.arange(len(start)), turned)
     fans_at = np.bincount(start[np.unique(fan, return_index=True)[1]], minlength=len(points))
     if n_fans > np.count_nonzero(fans_at):
         point = int(np.argmax(fans_at > 1))
@@ -346,7 +345,7 @@ def _check_orbits(
     outer = np.flatnonzero(cell == n_cells)
     if not outer.size:
         return
-    outline = _components(len(start), outer, following[outer])[1]
+    outline = components(len(start), outer, following[outer])[1]
     extents = {
         int(k): float(np.prod(np.ptp(points[start[outer[outline[outer] == k]]], axis=0)))
         for k in np.unique(outline[outer])
@@ -376,13 +375,6 @@ def _check_side_counts(
             f"{names.cells(few)} {'has' if len(few) == 1 else 'have'} fewer",
             "Corners where only two edges meet are no junctions. Merge such a cell with a neighbour.",
         )
-
-
-def _components(
-    n: int, a: Int[np.ndarray, " links"], b: Int[np.ndarray, " links"]
-) -> tuple[int, Int[np.ndarray, " nodes"]]:
-    links = coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n))
-    return connected_components(links, directed=False)
 
 
 def _listed(names: list[str]) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vertax._base.checks import as_key, check_concrete, check_integer
+from vertax.initialise._nearby_corners import cross
 from vertax.initialise._overlap_repair import repair_overlaps
 from vertax.initialise._spatial_order import spatial_order
 from vertax.initialise._voronoi import tessellate
@@ -104,12 +105,12 @@ def _cut_out(
     last, swept = start.copy(), np.zeros(len(start))
     walking = np.ones(len(start), bool)
     while walking.any():
-        step = 0.5 * _cross(corners[last], corners[following[last]])
+        step = 0.5 * cross(corners[last], corners[following[last]])
         swept[walking] += step[walking]
         walking &= ~junction[twin[last] // 3]
         last = np.where(walking, following[last], last)
     chord = corners[following[last]] - corners[start]
-    bulge = swept - 0.5 * _cross(corners[start], chord)
+    bulge = swept - 0.5 * cross(corners[start], chord)
 
     number = np.cumsum(junction) - 1
     rename = lambda h: 3 * number[h // 3] + h % 3
@@ -126,7 +127,3 @@ def _cut_out(
     angle = angle_of_area(bulge[outline], np.linalg.norm(chord[outline], axis=1))
     angles[np.asarray(cluster.edge)[first[outline]]] = angle
     return vertices, cluster, angles
-
-
-def _cross(p: Float[np.ndarray, "n 2"], q: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]

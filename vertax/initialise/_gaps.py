@@ -32,22 +32,7 @@ def fill_gaps(
 ) -> np.ndarray:
     """Give each gap the nearest label."""
     gap = image == GAP
-    if not gap.any():
-        return image
-    pad = np.zeros((2, 2), int)
-    if periodic:
-        # The nearest label on the torus is at most as far as the nearest one in the image. (In a mirrored
-        # image the original is never farther than its mirror image.)
-        reach = np.max(np.asarray(distance_transform_edt(gap, spacing)))
-        pad = np.minimum(np.ceil(reach / np.array(spacing)), image.shape).astype(int)
-        pad = np.repeat(pad[:, None], 2, axis=1)
-        gap = np.pad(gap, pad, mode="wrap")
-    y, x = np.asarray(
-        distance_transform_edt(gap, spacing, return_distances=False, return_indices=True)
-    )
-    rows, columns = image.shape
-    home = (slice(pad[0, 0], pad[0, 0] + rows), slice(pad[1, 0], pad[1, 0] + columns))
-    return image[(y[home] - pad[0, 0]) % rows, (x[home] - pad[1, 0]) % columns]
+    return image[nearest_outside(gap, spacing, periodic=periodic)[1]] if gap.any() else image
 
 
 def line_width(
@@ -63,7 +48,7 @@ def line_width(
     """
     if not np.any(image == GAP):
         return 0.0, 0.0
-    distance, nearest = _nearest_outside(image == GAP, spacing)
+    distance, nearest = nearest_outside(image == GAP, spacing)
     filled = image[nearest]
     first, second, width = [], [], []
     for one, other in _PAIRS:
@@ -83,13 +68,25 @@ def line_width(
     return (float(np.quantile(close, _QUANTILE)) if len(close) else 0.0), float(np.median(every))
 
 
-def _nearest_outside(
-    region: Bool[np.ndarray, "rows columns"], spacing: tuple[float, float]
+def nearest_outside(
+    region: Bool[np.ndarray, "rows columns"],
+    spacing: tuple[float, float],
+    *,
+    periodic: bool = False,
 ) -> tuple[Float[np.ndarray, "rows columns"], tuple[np.ndarray, np.ndarray]]:
     """Distance of each pixel from the nearest one outside a region, and the index of that pixel."""
     transform: Any = distance_transform_edt(region, spacing, return_indices=True)
     distance, (y, x) = transform
-    return distance, (y, x)
+    if not periodic:
+        return distance, (y, x)
+    # The nearest pixel on the torus is at most as far as the nearest one in the image.
+    rows, columns = region.shape
+    top, left = np.minimum(np.ceil(np.max(distance) / np.array(spacing)), region.shape).astype(int)
+    wrapped = np.pad(region, [(top, top), (left, left)], mode="wrap")
+    transform = distance_transform_edt(wrapped, spacing, return_indices=True)
+    home = (slice(top, top + rows), slice(left, left + columns))
+    distance, (y, x) = transform[0][home], (index[home] for index in transform[1])
+    return distance, ((y - top) % rows, (x - left) % columns)
 
 
 _PAIRS = (
@@ -155,7 +152,7 @@ def with_exterior(
     code[regions[0, 0]] = EXTERIOR
     code[0] = GAP
     open_region = code[regions]
-    away, nearest = _nearest_outside(open_region == GAP, spacing)
+    away, nearest = nearest_outside(open_region == GAP, spacing)
     near = gap & (away <= reach)
     return FilledGaps(
         fill_gaps(np.where(near, open_region[nearest], image), spacing=spacing), margin
@@ -171,22 +168,3 @@ def largest_cluster(
     sizes = np.bincount(cluster.ravel())
     sizes[0] = 0
     return np.where(cluster == np.argmax(sizes), image, exterior)
-
-
-def distance_within(
-    region: Bool[np.ndarray, "rows columns"],
-    spacing: tuple[float, float],
-    *,
-    periodic: bool,
-) -> Float[np.ndarray, "rows columns"]:
-    """Distance of each pixel of a region from the nearest pixel outside it."""
-    if not region.any():
-        return np.zeros(region.shape)
-    distance = np.asarray(distance_transform_edt(region, spacing))
-    if not periodic:
-        return distance
-    pad = np.minimum(np.ceil(np.max(distance) / np.array(spacing)), region.shape).astype(int)
-    wrapped = np.pad(region, np.repeat(pad[:, None], 2, axis=1), mode="wrap")
-    rows, columns = region.shape
-    around_torus = np.asarray(distance_transform_edt(wrapped, spacing))
-    return around_torus[pad[0] : pad[0] + rows, pad[1] : pad[1] + columns]

@@ -17,10 +17,10 @@ from vertax.initialise._gaps import (
     EXTERIOR,
     GAP,
     default_gap_width,
-    distance_within,
     fill_gaps,
     largest_cluster,
     line_width,
+    nearest_outside,
     with_exterior,
 )
 from vertax.initialise._heights import surface_of
@@ -190,11 +190,9 @@ def from_labels(
         )
     sides = pixel_sides(1.0 if pixel_size is None else pixel_size)
     sized, arcs = pixel_size is not None, inner_arcs if height is None else None
-    options = _Options(sides, sized, gap_width, holes == "keep", softening, arcs, background)
-    if boundary == "free":
-        result = _free(values, image, options)
-    else:
-        result = _closed(values, image, options, periodic=boundary == "periodic")
+    keep_holes = holes == "keep" and boundary == "free"
+    options = _Options(boundary, sides, sized, gap_width, keep_holes, softening, arcs, background)
+    result = _segmentation(values, image, options)
     if height is None:
         return result
     surface = surface_of(result, height, plane_distance, unknown_height, sized=sized)
@@ -204,12 +202,14 @@ def from_labels(
 class _Options(NamedTuple):
     """Arguments of `from_labels`."""
 
+    boundary: str
     sides: Float[np.ndarray, " xy"]
     """Width and height of a pixel, or their ratio."""
     sized: bool
     """Whether `sides` are lengths."""
     gap_width: float | None
     keep_holes: bool
+    """Whether holes are faces of a free tissue."""
     softening: float | None
     inner_arcs: bool | None
     """None for a tissue without any arc."""
@@ -228,199 +228,137 @@ class _Options(NamedTuple):
         return self.sides / np.sqrt(mean_area * np.prod(self.sides))
 
 
-def _closed(
+class _Faces(NamedTuple):
+    """The faces of a tissue in an image."""
+
+    mesh: Mesh
+    """Their mesh; the number of a copy in a mirrored image is that of its original plus that of all faces."""
+    cells: Int[np.ndarray, "box_rows box_columns"]
+    """The number of each pixel: the image in its margin, or with its mirror images."""
+    margin: int
+    """Width of the exterior around the given image, in pixels."""
+    names: Int[np.ndarray, " faces"]
+    """The label of each face, 0 for holes and the exterior."""
+    parent: Int[np.ndarray, " faces"]
+    """The index of its label in the mask; GAP for holes and the exterior."""
+    exterior: int | None
+    widths: tuple[float, float]
+    """Largest width of gaps that were closed, and the width of lines as measured."""
+
+
+def _faces_of(
     values: Int[np.ndarray, " labels"],
-    image: Int[np.ndarray, "rows columns"],
+    given: Int[np.ndarray, "rows columns"],
     options: _Options,
-    *,
-    periodic: bool,
-) -> Segmentation:
-    """The part of `from_labels` for periodic and mirrored tissues."""
-    given, spacing = image, options.spacing
-    measured, _ = line_width(image, spacing)
+) -> _Faces:
+    """The image without gaps, with labels in one piece, repaired until there is a mesh of its faces."""
+    free, periodic = options.boundary == "free", options.boundary == "periodic"
+    spacing, n_values = options.spacing, len(values)
+    measured, apart = line_width(given, spacing)
     gap_width = default_gap_width(measured) if options.gap_width is None else options.gap_width
-    image = fill_gaps(image, periodic=periodic, spacing=spacing)
-    image, parents = join_pieces(image, len(values), periodic, keep_holes=False)
-    names = _names(values, parents)
+    if free:
+        image, outside = without_specks(given, spacing)
+        image, margin = with_exterior(image, gap_width, spacing, keep_holes=options.keep_holes)
+        image = np.where(np.pad(outside, margin), EXTERIOR, image)
+    else:
+        image, margin = fill_gaps(given, periodic=periodic, spacing=spacing), 0
+    image, parents = join_pieces(image, n_values, periodic, keep_holes=options.keep_holes)
+    n_labels, exterior, remedy = n_values + len(parents), None, ""
+    # New labels come after the largest one.
+    names = np.append(values, values[-1] + 1 + np.arange(len(parents)))
+    if free:
+        image, exterior = numbered(image, n_labels)
+        names = np.append(names, np.zeros(exterior - n_labels + 1, int))
+        if apart > gap_width:
+            remedy = (
+                f"Neighbouring labels are {apart:.0f} pixels apart (median), and only gaps of at most "
+                f"{gap_width:g} pixels were closed: pass gap_width={np.ceil(apart) + 1:.0f}."
+            )
     n = len(names)
+    parent = np.concatenate([np.arange(n_values), parents, np.full(n - n_labels, GAP)])
+    holes, arcs = np.arange(n_labels, n - free), options.inner_arcs is not None
     while True:
-        cells = image if periodic else _mirror(image, n)
-        mesh = mesh_or_repairs(crack_graph(cells), names)
+        if exterior is not None:
+            image = largest_cluster(image, exterior)
+        cells = _mirror(image, n) if options.boundary == "mirrored" else image
+        mesh = mesh_or_repairs(crack_graph(cells), names, exterior, remedy, arcs=arcs)
         if isinstance(mesh, Mesh):
-            break
-        image = mesh[image]
-
-    label = mesh.cells % n
-    size = np.array(cells.shape[::-1], float)
-    pixels = np.bincount(cells.ravel(), minlength=4 * n)[mesh.cells]
-    bulge = np.bincount(mesh.cell, mesh.bulge, len(label)) if options.inner_arcs else 0.0 * pixels
-    vertices, moved = untangle(mesh, size, pixels, bulge)
-    if vertices is None:
-        raise _no_polygons(names[label[moved]])
-    lengths = options.lengths(size.prod() / len(label))
-    dtype = jnp.result_type(float)
-    tissue = Tissue(
-        jnp.asarray(vertices * lengths, dtype),
-        Topology(mesh.twin, mesh.cell, mesh.frame),
-        Periodic(jnp.asarray(np.diag(size * lengths), dtype)),
-        options.softening,
-    )
-    if options.inner_arcs:
-        curved = np.full(len(mesh.cell), True)
-        tissue = _with_arcs(tissue, mesh, curved, lengths, inner_arcs=True)
-    uncut = np.ones(len(label), bool)
-    if not periodic:
-        top_bottom, left_right = _touching(image, n)
-        uncut = (mesh.cells < n) & ~(top_bottom | left_right)[label]
-    parent = np.append(np.arange(len(values)), parents)
-    depth = distance_within(parent[image] != given, spacing, periodic=periodic)
-    repaired = Repaired(values, given, image, names, None, np.unique(label))
-    return _segmentation(
-        tissue,
-        mesh,
-        repaired,
-        depth if periodic else _reflected(depth),
-        (gap_width, measured),
-        lengths,
-        label=label,
-        complete=uncut,
-        moved=moved,
-        pixels=pixels,
-        background=options.background,
-    )
-
-
-def _free(
-    values: Int[np.ndarray, " labels"],
-    image: Int[np.ndarray, "rows columns"],
-    options: _Options,
-) -> Segmentation:
-    """The part of `from_labels` for a free cluster."""
-    given, spacing = image, options.spacing
-    measured, apart = line_width(image, spacing)
-    gap_width = default_gap_width(measured) if options.gap_width is None else options.gap_width
-    image, outside = without_specks(image, spacing)
-    image, margin = with_exterior(image, gap_width, spacing, keep_holes=options.keep_holes)
-    image = np.where(np.pad(outside, margin), EXTERIOR, image)
-    image, parents = join_pieces(image, len(values), False, keep_holes=options.keep_holes)
-    n_labels = len(values) + len(parents)
-    image, exterior = numbered(image, n_labels)
-    names = np.append(_names(values, parents), np.zeros(exterior - n_labels + 1, int))
-    remedy = ""
-    if apart > gap_width:
-        remedy = (
-            f"Neighbouring labels are {apart:.0f} pixels apart (median), and only gaps of at most "
-            f"{gap_width:g} pixels were closed: pass gap_width={np.ceil(apart) + 1:.0f}."
-        )
-    while True:
-        image = largest_cluster(image, exterior)
-        arcs = options.inner_arcs is not None
-        mesh = mesh_or_repairs(crack_graph(image), names, exterior, remedy, arcs=arcs)
-        if isinstance(mesh, Mesh):
-            break
+            widths = gap_width, measured
+            return _Faces(mesh, cells, margin, names, parent, exterior, widths)
         # A hole with fewer than three sides is shared out among the cells next to it.
-        lost = np.flatnonzero(mesh[n_labels:exterior] != np.arange(n_labels, exterior)) + n_labels
+        lost = holes[mesh[holes] != holes]
         mesh[lost] = lost
         image = mesh[image]
         if len(lost):
             image = fill_gaps(np.where(np.isin(image, lost), GAP, image), spacing=spacing)
 
-    label = mesh.cells[:-1]
-    n_cells = len(label)
-    left, right = mesh.cell, mesh.cell[mesh.twin]
-    curved = (left == n_cells) | (right == n_cells)
-    if options.inner_arcs is not False:
-        curved = np.full(len(left), options.inner_arcs is True)
-    pixels = np.bincount(image.ravel(), minlength=exterior + 1)[mesh.cells]
-    bulge = np.bincount(left, np.where(curved, mesh.bulge, 0.0), n_cells + 1)
-    pixels[-1] = 0  # the exterior is no cell, and has no area
-    bulge[-1] = np.inf
-    size = np.array(image.shape[::-1], float)
-    vertices, moved = untangle(mesh, size, pixels, bulge)
-    moved, pixels = moved[:-1], pixels[:-1]
-    if vertices is None:
-        raise _no_polygons(names[label[moved]])
-    topology = Topology(mesh.twin, mesh.cell, mesh.frame, exterior=True)
-    lengths = options.lengths(float(np.mean(pixels[names[label] > 0])))
-    corners = jnp.asarray((vertices - margin) * lengths, jnp.result_type(float))
-    tissue = Tissue(corners, topology, Free(), options.softening)
-    if options.inner_arcs is not None:
-        tissue = _with_arcs(tissue, mesh, curved, lengths, inner_arcs=options.inner_arcs)
-    rows, columns = given.shape
-    home = image[margin : margin + rows, margin : margin + columns]
-    top_bottom, left_right = _touching(home, exterior + 1)
-    # Pixels of a face other than the one of their label; holes and the exterior have none.
-    parent = np.concatenate(
-        [np.arange(len(values)), parents, np.full(exterior - n_labels + 1, GAP)]
-    )
-    depth = distance_within(parent[home] != given, spacing, periodic=False)
-    repaired = Repaired(values, given, home, names, exterior, label)
-    return _segmentation(
-        tissue,
-        mesh,
-        repaired,
-        depth,
-        (gap_width, measured),
-        lengths,
-        label=label,
-        complete=~(top_bottom | left_right)[label] & (names[label] > 0),
-        moved=moved,
-        pixels=pixels,
-        background=options.background,
-        margin=margin,
-    )
-
-
-def _names(
-    values: Int[np.ndarray, " labels"], parents: Int[np.ndarray, " new_labels"]
-) -> Int[np.ndarray, " all_labels"]:
-    """The labels, and new ones after the largest of them."""
-    return np.append(values, values[-1] + 1 + np.arange(len(parents)))
-
-
-def _shape(image: Int[np.ndarray, "rows columns"]) -> tuple[int, int]:
-    return int(image.shape[0]), int(image.shape[1])
-
 
 def _segmentation(
-    tissue: Tissue,
-    mesh: Mesh,
-    repaired: Repaired,
-    depth: Float[np.ndarray, "box_rows box_columns"],
-    widths: tuple[float, float],
-    lengths: Float[np.ndarray, " xy"],
-    *,
-    label: Int[np.ndarray, " cells"],
-    complete: Bool[np.ndarray, " cells"],
-    moved: np.ndarray,
-    pixels: Int[np.ndarray, " cells"],
-    background: int | None,
-    margin: int = 0,
+    values: Int[np.ndarray, " labels"],
+    given: Int[np.ndarray, "rows columns"],
+    options: _Options,
 ) -> Segmentation:
     """The tissue without overlaps, the points of its edges, and the report on the mask."""
-    edge, points = _courses(tissue.topology, mesh, margin)
+    faces = _faces_of(values, given, options)
+    mesh, names, margin, free = faces.mesh, faces.names, faces.margin, faces.exterior is not None
+    n, n_cells = len(names), len(mesh.cells) - free
+    label = mesh.cells[:n_cells] % n
+    curved = (mesh.cell == n_cells) | (mesh.cell[mesh.twin] == n_cells)
+    if options.inner_arcs is not False:
+        curved = np.full(len(curved), options.inner_arcs is True)
+    pixels = np.bincount(faces.cells.ravel(), minlength=4 * n)[mesh.cells]
+    bulge = np.bincount(mesh.cell, np.where(curved, mesh.bulge, 0.0), len(mesh.cells))
+    if free:
+        pixels[-1], bulge[-1] = 0, np.inf  # the exterior is no cell, and has no area
+    size = np.array(faces.cells.shape[::-1], float)
+    vertices, moved = untangle(mesh, size, pixels, bulge)
+    moved, pixels = moved[:n_cells], pixels[:n_cells]
+    if vertices is None:
+        raise ValueError(
+            "Argument `mask` must hold cells that polygons can stand for, but no polygons of positive "
+            f"area were found around the labels {listed(names[label[moved]])}. Smooth their outlines or "
+            "merge them with a neighbour."
+        )
+    lengths = options.lengths(float(np.mean(pixels[names[label] > 0])))
+    dtype = jnp.result_type(float)
+    tissue = Tissue(
+        jnp.asarray((vertices - margin) * lengths, dtype),
+        Topology(mesh.twin, mesh.cell, mesh.frame, exterior=free),
+        Free() if free else Periodic(jnp.asarray(np.diag(size * lengths), dtype)),
+        options.softening,
+    )
+    if curved.any():
+        tissue = _with_arcs(tissue, mesh, curved, lengths, inner_arcs=options.inner_arcs is True)
+
+    rows, columns = given.shape
+    home = faces.cells[margin : margin + rows, margin : margin + columns] % n
+    complete = (mesh.cells[:n_cells] < n) & (names[label] > 0)
+    periodic = options.boundary == "periodic"
+    if not periodic:
+        complete &= ~np.logical_or(*_touching(home, n))[label]
+    # Pixels of a face other than the one of their label.
+    depth, _ = nearest_outside(faces.parent[home] != given, options.spacing, periodic=periodic)
     # A free tissue has a margin of unchanged pixels; the box of the others repeats itself.
-    room = 2 * margin
-    padded = np.pad(depth, room) if room else depth
-    depth_at = lambda row, column: padded[
-        (row + room) % padded.shape[0], (column + room) % padded.shape[1]
-    ]
+    box, room = depth, 2 * margin
+    if options.boundary == "mirrored":
+        box = np.pad(depth, [(0, rows), (0, columns)], mode="symmetric")
+    box = np.pad(box, room)
+    depth_at = lambda row, column: box[(row + room) % box.shape[0], (column + room) % box.shape[1]]
+    edge, points = _courses(tissue.topology, mesh, margin)
     chord = np.linalg.norm(geometry_of(tissue).edge_vectors, axis=1) / lengths.min()
-    shown, uncertain, point_shown = contacts_of(edge, points, chord, depth_at, widths[0])
-    rows, columns = repaired.given.shape
-    report = report_on(repaired, (shown, uncertain), depth[:rows, :columns], widths, pixels)
-    names = repaired.names
+    shown, uncertain, point_shown = contacts_of(edge, points, chord, depth_at, faces.widths[0])
+    repaired = Repaired(values, given, home, names, faces.exterior, label)
     return Segmentation(
         tissue=repair_overlaps(tissue, bend_back=True),
         labels=names[label],
         complete=complete,
-        absorbed=np.setdiff1d(repaired.values, names[label]),
+        absorbed=np.setdiff1d(values, names[label]),
         inflated=np.unique(names[label[moved]]),
         pixel_size=as_pixel_size(lengths),
-        image_shape=_shape(repaired.given),
-        background=background,
+        image_shape=(rows, columns),
+        background=options.background,
         courses=Courses(edge, points * lengths, point_shown),
-        report=report,
+        report=report_on(repaired, (shown, uncertain), depth, faces.widths, pixels),
     )
 
 
@@ -459,14 +397,6 @@ def _with_arcs(
     )
 
 
-def _no_polygons(labels: Int[np.ndarray, " labels"]) -> ValueError:
-    return ValueError(
-        "Argument `mask` must hold cells that polygons can stand for, but no polygons of positive "
-        f"area were found around the labels {listed(labels)}. Smooth their outlines or merge them "
-        "with a neighbour."
-    )
-
-
 def _touching(
     image: Int[np.ndarray, "rows columns"], n: int
 ) -> tuple[Bool[np.ndarray, " labels"], Bool[np.ndarray, " labels"]]:
@@ -477,12 +407,6 @@ def _touching(
     return top_bottom, left_right
 
 
-def _reflected(image: Shaped[np.ndarray, "rows columns"]) -> np.ndarray:
-    """The image and its three mirror images."""
-    wide = np.hstack([image, image[:, ::-1]])
-    return np.vstack([wide, wide[::-1]])
-
-
 def _mirror(image: Int[np.ndarray, "rows columns"], n: int) -> np.ndarray:
     """The image and its three mirror images, with cell number `label + n * copy`.
 
@@ -490,13 +414,8 @@ def _mirror(image: Int[np.ndarray, "rows columns"], n: int) -> np.ndarray:
     the copy on the side of the original.
     """
     top_bottom, left_right = _touching(image, n)
-    label = np.arange(n, dtype=np.int32)
-
-    def quadrant(row: int, column: int) -> np.ndarray:
-        copy = 2 * np.where(top_bottom, 0, row) + np.where(left_right, 0, column)
-        return label + n * copy.astype(np.int32)
-
-    flipped = image[:, ::-1]
-    upper = np.hstack([quadrant(0, 0)[image], quadrant(0, 1)[flipped]])
-    lower = np.hstack([quadrant(1, 0)[image], quadrant(1, 1)[flipped]])
-    return np.vstack([upper, lower[::-1]])
+    rows, columns = image.shape
+    mirrored = np.pad(image, [(0, rows), (0, columns)], mode="symmetric")
+    below, beside = np.arange(2 * rows)[:, None] >= rows, np.arange(2 * columns) >= columns
+    copy = 2 * (below & ~top_bottom[mirrored]) + (beside & ~left_right[mirrored])
+    return mirrored + n * copy.astype(np.int32)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Int, Shaped
@@ -11,16 +10,14 @@ from jaxtyping import Array, Int, Shaped
 from vertax._base.checks import check_concrete
 from vertax.initialise._labels import Segmentation, from_labels
 from vertax.initialise._mask_arguments import check_options, check_zero
-from vertax.initialise._segmenters import AbstractSegmenter, Watershed, check_image
+from vertax.initialise._segmenters import Segmenter, Watershed, check_image
 from vertax.surfaces import AbstractSurface
-
-Segmenter: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 def from_microscopy(
     image: Shaped[np.ndarray | Array, " *shape"],
     *,
-    segmenter: AbstractSegmenter | Segmenter | None = None,
+    segmenter: Segmenter | None = None,
     boundary: str = "mirrored",
     pixel_size: float | None = None,
     softening: float | None = None,

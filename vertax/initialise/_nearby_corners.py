@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Float, Int, Shaped
 from scipy.spatial import KDTree
+
+from vertax.initialise._pieces import components
 
 _Result = TypeVar("_Result")
 _STEPS = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
@@ -123,11 +123,16 @@ def areas_and_centroids(
         ring = position[cell] if lattice is None else position[cell] + image @ lattice
         rest = ring - ring[0]
         following = np.roll(rest, -1, axis=0)
-        swept = rest[:, 0] * following[:, 1] - rest[:, 1] * following[:, 0]
+        swept = cross(rest, following)
         areas.append(0.5 * swept.sum())
         middle = swept @ (rest + following) / (6 * areas[-1]) if areas[-1] else rest.mean(axis=0)
         centroids.append(ring[0] + middle)
     return np.array(areas), np.array(centroids)
+
+
+def cross(p: Shaped[np.ndarray, "n 2"], q: Shaped[np.ndarray, "n 2"]) -> Shaped[np.ndarray, " n"]:
+    """Cross products of vectors in the plane."""
+    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
 
 
 def _merged(
@@ -140,9 +145,7 @@ def _merged(
     if lattice is not None:
         place, source, _ = with_images(position, lattice, 2 * tolerance)
     links = source[KDTree(place).query_pairs(tolerance, output_type="ndarray")]
-    n = len(position)
-    graph = coo_array((np.ones(len(links), bool), (links[:, 0], links[:, 1])), shape=(n, n))
-    group = connected_components(graph, directed=False)[1]
+    group = components(len(position), links[:, 0], links[:, 1])[1]
     first = np.unique(group, return_index=True)[1]
     return np.argsort(np.argsort(first))[group]
 
@@ -196,7 +199,7 @@ def _corners_on_sides(
     length = 2 * half[side]
     # Along the side from its middle, and across it, in units of length.
     parallel = np.sum(away * along, axis=1) / length
-    across = (along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0]) / length
+    across = cross(along, away) / length
     on_side = (np.abs(across) <= tolerance) & (np.abs(parallel) < half[side])
     side, candidate, parallel = side[on_side], candidate[on_side], parallel[on_side]
     inserted = np.column_stack([owner[side], source[candidate], shift[candidate] + home[side]])

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vertax._base.announce import announced_jit
-from vertax.mesh import Periodic, Tissue, crossed_sides, geometry_of
+from vertax.mesh import Tissue, crossed_sides, geometry_of, pad
 
 # Largest number of rounds of flattening, and of bending back.
 _ROUNDS = 60
@@ -26,29 +26,21 @@ def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
     - `ValueError` if cells still overlap after 60 rounds.
     """
     angles = None if tissue.arcs is None else np.asarray(tissue.arcs.angles)
-    m = tissue.topology
-    cell, twin = np.asarray(m.cell), np.asarray(m.twin)
-    following = np.where(twin % 3 == 0, twin + 2, twin - 1)
-    changed = np.ones(m.n_faces, bool)
     for attempt in range(_ROUNDS):
-        crossed = _crossed(tissue, following, cell, changed)
-        bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
+        crossed = _crossed(tissue)
         if not crossed.any():
             if angles is None or not bend_back or attempt == 0:
                 return tissue
-            return _bent_back(tissue, angles, following, cell)
+            return _bent_back(tissue, angles)
+        touched = _edges_of(tissue, crossed, whole_cells=True)
         geometry = geometry_of(tissue)
-        ends, faces = geometry.edge_vertices, geometry.edge_cells
-        touched = np.any(np.append(bad, False)[faces], axis=1)
-        touched[np.asarray(m.edge)[crossed]] = True
-        changed = np.zeros(m.n_faces, bool)
-        changed[cell.reshape(-1, 3)[np.unique(ends[touched])]] = True
+        ends = geometry.edge_vertices
         if tissue.arcs is not None:
             tissue = tissue.with_angles(jnp.where(touched, 0.7, 1) * tissue.arcs.angles)
         if tissue.arcs is None or attempt >= _ROUNDS // 4:
-            moving = np.zeros(m.n_vertices, bool)
+            moving = np.zeros(tissue.n_vertices, bool)
             moving[ends[touched]] = True
-            step = np.zeros((m.n_vertices, 2))
+            step = np.zeros((tissue.n_vertices, 2))
             vectors = geometry.edge_vectors
             np.add.at(step, ends[:, 0], vectors / 3)
             np.add.at(step, ends[:, 1], -vectors / 3)
@@ -61,81 +53,52 @@ def repair_overlaps(tissue: Tissue, *, bend_back: bool = False) -> Tissue:
     )
 
 
-def _bent_back(
-    tissue: Tissue,
-    angles: Float[np.ndarray, " edges"],
-    following: Int[np.ndarray, " halfedges"],
-    cell: Int[np.ndarray, " halfedges"],
-) -> Tissue:
+def _bent_back(tissue: Tissue, angles: Float[np.ndarray, " edges"]) -> Tissue:
     """The tissue with each arc as near to an angle as possible without overlaps."""
-    m = tissue.topology
-    edge = np.asarray(m.edge)
     assert tissue.arcs is not None
     flat = np.asarray(tissue.arcs.angles)
-    faces = geometry_of(tissue).edge_cells
+    bent = lambda x: tissue.with_angles(jnp.asarray(flat + x * (angles - flat), flat.dtype))
     fraction, limit = np.ones(len(flat)), np.ones(len(flat))
-    changed = np.ones(m.n_faces, bool)
     for attempt in range(_ROUNDS):
-        trial = tissue.with_angles(jnp.asarray(flat + fraction * (angles - flat), flat.dtype))
-        crossed = _crossed(trial, following, cell, changed)
+        result = bent(fraction)
+        crossed = _crossed(result)
         if not crossed.any():
-            tissue = trial
             break
         # First the arcs that cross another side, then all arcs of these cells.
-        touched = np.zeros(len(flat), bool)
-        touched[edge[crossed]] = True
-        if attempt >= _ROUNDS // 3:
-            bad = np.bincount(cell, crossed, m.n_faces)[: m.n_cells] > 0
-            touched |= np.any(np.append(bad, False)[faces], axis=1)
+        touched = _edges_of(tissue, crossed, whole_cells=attempt >= _ROUNDS // 3)
         limit = np.where(touched, fraction, limit)
-        changed = np.zeros(m.n_faces, bool)
-        changed[faces[touched]] = True
         fraction = np.where(touched, np.where(fraction > 0.05, 0.6 * fraction, 0.0), fraction)
     else:
         return tissue
-    changed = np.zeros(m.n_faces, bool)
-    changed[faces[fraction < limit]] = True
     for _ in range(_BISECTIONS):
         middle = 0.5 * (fraction + limit)
-        trial = tissue.with_angles(jnp.asarray(flat + middle * (angles - flat), flat.dtype))
-        crossed = _crossed(trial, following, cell, changed)
-        touched = np.zeros(len(flat), bool)
-        touched[edge[crossed]] = True
+        trial = bent(middle)
+        crossed = _crossed(trial)
+        touched = _edges_of(tissue, crossed, whole_cells=False)
         limit = np.where(touched, middle, limit)
         fraction = np.where(touched, fraction, middle)
-        tissue = tissue if crossed.any() else trial
-    return tissue
+        result = result if crossed.any() else trial
+    return result
 
 
-def _crossed(
-    tissue: Tissue,
-    following: Int[np.ndarray, " halfedges"],
-    cell: Int[np.ndarray, " halfedges"],
-    changed: Bool[np.ndarray, " faces"],
-) -> Bool[np.ndarray, " halfedges"]:
-    """Which half-edges cross another side of their face; only faces that `changed` are compared."""
-    n = following.size
-    start = np.repeat(np.asarray(tissue.vertices), 3, axis=0)
-    if isinstance(tissue.boundary, Periodic):
-        start = start + np.asarray(tissue.topology.frame) @ np.asarray(tissue.boundary.lattice)
-    sides = np.concatenate([start, start[following] - start], axis=1)
-    if tissue.arcs is not None:
-        edge, half_edge = (np.asarray(x) for x in (tissue.topology.edge, tissue.topology.half_edge))
-        angles = np.asarray(tissue.arcs.angles)
-        if not tissue.inner_arcs:
-            angles = np.where(
-                cell[np.asarray(tissue.topology.twin)[half_edge]] == tissue.n_cells, angles, 0
-            )
-        forward = half_edge[edge] == np.arange(n)
-        sides = np.column_stack([sides, np.where(forward, 1, -1) * angles[edge]])
-    some = np.flatnonzero(changed[cell])
-    number = np.zeros(n, int)
-    number[some] = np.arange(len(some))
-    crossed = np.zeros(n, bool)
-    if len(some):
-        other = crossed_by(sides[some], number[following[some]], cell[some])
-        crossed[some] = other != np.arange(len(some))
-    return crossed
+def _crossed(tissue: Tissue) -> Bool[np.ndarray, " halfedges"]:
+    """Which half-edges cross another side of their face."""
+    # (Tissues of similar sizes share the compiled function.)
+    return np.asarray(pad(tissue).overlaps.sides)[: tissue.topology.n_half_edges]
+
+
+def _edges_of(
+    tissue: Tissue, crossed: Bool[np.ndarray, " halfedges"], *, whole_cells: bool
+) -> Bool[np.ndarray, " edges"]:
+    """The edges of half-edges, or all edges of their cells as well."""
+    m = tissue.topology
+    edges = np.zeros(m.n_edges, bool)
+    edges[np.asarray(m.edge)[crossed]] = True
+    if whole_cells:
+        bad = np.bincount(np.asarray(m.cell), crossed, m.n_faces) > 0
+        bad[m.n_cells :] = False
+        edges |= np.any(bad[geometry_of(tissue).edge_cells], axis=1)
+    return edges
 
 
 def crossed_by(

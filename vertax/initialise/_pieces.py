@@ -43,12 +43,19 @@ def connected_pieces(image: Integer[np.ndarray, "rows columns"], periodic: bool)
     a, b = np.concatenate(above), np.concatenate(below)
     value = image[start]
     same = value[a] == value[b]
-    links = coo_array((np.ones(same.sum(), bool), (a[same], b[same])), shape=(len(value),) * 2)
-    n_pieces, piece_of_run = connected_components(links, directed=False)
+    n_pieces, piece_of_run = components(len(value), a[same], b[same])
     value_of_piece = np.zeros(n_pieces, image.dtype)
     value_of_piece[piece_of_run] = value
     piece = piece_of_run[run]
     return Pieces(piece, value_of_piece, np.bincount(piece.ravel(), minlength=n_pieces))
+
+
+def components(
+    n: int, a: Int[np.ndarray, " links"], b: Int[np.ndarray, " links"]
+) -> tuple[int, Int[np.ndarray, " nodes"]]:
+    """Number of the connected parts of a graph of n nodes with links from a to b, and the part of each."""
+    links = coo_array((np.ones(len(a), bool), (a, b)), shape=(n, n))
+    return connected_components(links, directed=False)
 
 
 def cell_size(pieces: Pieces) -> float:

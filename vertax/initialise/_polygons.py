@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from vertax._base.checks import as_float64, check_concrete, check_number, describe
 from vertax.initialise._faces import FaceMesh, Names, Sides, build_faces
-from vertax.initialise._nearby_corners import build_within, share_corners, size_of_cells
+from vertax.initialise._nearby_corners import build_within, cross, share_corners, size_of_cells
 from vertax.initialise._overlap_repair import crossed_by, repair_overlaps
 from vertax.mesh import Free, Periodic, Tissue, angle_of_area, geometry_of
 from vertax.surfaces import HeightMap
@@ -137,22 +137,26 @@ def tissue_from_near_corners(
     *,
     box: ArrayLike | Sequence[Any] | None,
     images: Sequence[Any] | None = None,
+    relative_tolerance: float | None = None,
     **settings: Any,
 ) -> PolygonTissue:
-    """`from_polygons`, with other names for points and cells in messages."""
+    """`from_polygons`, with other names for points and cells in messages.
+
+    `relative_tolerance` is the default of `tolerance`, in root mean cell areas.
+    """
     check_concrete("from_polygons", points, box, tolerance)
     if tolerance is not None:
         check_number("tolerance", tolerance, at_least=0)
-    if np.ndim(points) == 2 and np.shape(points)[1] == 3:
-        options = {"box": box, "images": images} | settings
-        flat = lambda xy: tissue_from_near_corners(xy, cells, names, tolerance, **options)
-        return on_surface_through(points, flat, names)
-    position = _checked_points(points, names)
+    given = _checked_points(points, names)
+    position = given[:, :2]
     corners = _checked_cells(cells, position, names)
     lattice = _checked_box(box, images)
     image = corner_images(images, corners, position, lattice, names)
+    size = size_of_cells(position, corners, image, lattice)
 
     def build(within: float) -> PolygonTissue:
+        if within < 0:
+            return tissue_from_corners(position, corners, names, box=box, images=images, **settings)
         shared = share_corners(position, corners, image, lattice, within)
         result = tissue_from_corners(
             shared.points,
@@ -170,26 +174,17 @@ def tissue_from_near_corners(
             side_edges=np.append(result.side_edges, -1)[shared.side],
         )
 
-    as_given = lambda: tissue_from_corners(
-        position, corners, names, box=box, images=images, **settings
-    )
-    return build_within(
-        lambda within: as_given() if within < 0 else build(within),
-        -1.0 if tolerance is None else tolerance,
-        size_of_cells(position, corners, image, lattice),
-        names.subject,
-    )
+    within = -1.0 if tolerance is None else tolerance
+    if tolerance is None and relative_tolerance is not None:
+        within = relative_tolerance * size
+    return _on_surface(build_within(build, within, size, names.subject), given, names)
 
 
-def on_surface_through(
-    points: ArrayLike | Sequence[Any], build: Callable[[Any], PolygonTissue], names: Names
+def _on_surface(
+    result: PolygonTissue, position: Float[np.ndarray, "points dimensions"], names: Names
 ) -> PolygonTissue:
-    """The tissue that `build` makes of points in the plane; with z on the smooth surface through them."""
-    if np.ndim(points) != 2 or np.shape(points)[1] != 3:
-        return build(points)
-    position = as_float64("points", points)
-    result = build(position[:, :2])
-    if np.ptp(position[:, 2]) <= 1e-9 * np.ptp(position[:, :2]):
+    """The tissue on the smooth surface through points with z."""
+    if position.shape[1] == 2 or np.ptp(position[:, 2]) <= 1e-9 * np.ptp(position[:, :2]):
         return result
     flat = result.tissue
     if not isinstance(flat.boundary, Free) or flat.inner_arcs:
@@ -217,7 +212,8 @@ def tissue_from_corners(
 ) -> PolygonTissue:
     """`from_polygons` without `tolerance`, with other names for points and cells in messages."""
     check_concrete("from_polygons", points, box, open_cells, softening)
-    position = _checked_points(points, names)
+    given_points = _checked_points(points, names)
+    position = given_points[:, :2]
     corners = _checked_cells(cells, position, names)
     lattice = _checked_box(box, images)
     is_open = _checked_open(open_cells, len(corners))
@@ -292,7 +288,7 @@ def tissue_from_corners(
         split_points=np.flatnonzero(mesh.degree > 3),
         flattened_edges=np.zeros(topology.n_edges, bool),
     )
-    return _without_overlaps(result, of_kept)
+    return _on_surface(_without_overlaps(result, of_kept), given_points, names)
 
 
 def _without_overlaps(result: PolygonTissue, names: Names) -> PolygonTissue:
@@ -350,7 +346,8 @@ def _check_crossings(
 
 def _checked_points(
     points: ArrayLike | Sequence[Any], names: Names
-) -> Float[np.ndarray, "points 2"]:
+) -> Float[np.ndarray, "points dimensions"]:
+    """Positions with two or three coordinates."""
     array: Shaped[Any, "..."] = np.asarray(points)
     if array.ndim == 2 and array.dtype.kind == "f" and not np.isfinite(array).all():
         bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
@@ -359,7 +356,7 @@ def _checked_points(
             "not. Leave out such points and correct the cells that have them."
         )
     position = as_float64("points", points)
-    if position.ndim != 2 or position.shape[1] != 2 or not len(position):
+    if position.ndim != 2 or position.shape[1] not in (2, 3) or not len(position):
         raise ValueError(
             f"Argument `points` must have shape (points, 2), but has {position.shape}."
         )
@@ -527,7 +524,7 @@ def _counter_clockwise(
     first = np.cumsum(count) - count
     # Relative to a corner of the cell: the formula loses digits far from the origin.
     place = place - place[first][sides.cell]
-    area = np.bincount(sides.cell, 0.5 * _cross(place, place[sides.following]))
+    area = np.bincount(sides.cell, 0.5 * cross(place, place[sides.following]))
     extent = np.maximum.reduceat(np.abs(place).max(axis=1), first)
     empty = np.flatnonzero(~(np.abs(area) > 1e-12 * extent**2))
     if empty.size:
@@ -551,7 +548,7 @@ def _check_cover(
     names: Names,
 ) -> None:
     place = _places(sides, position, lattice)
-    cover = 0.5 * np.sum(_cross(place, place[sides.following])) / np.linalg.det(lattice)
+    cover = 0.5 * np.sum(cross(place, place[sides.following])) / np.linalg.det(lattice)
     if abs(cover - 1) > 1e-6:
         names.refuse(
             "fill the periodic box once",
@@ -578,11 +575,7 @@ def _angles(
     order = np.argsort(mesh.rank, kind="stable")
     target[mesh.half_edge[order]] = end[order]
     rest = place - origin[mesh.half_edge]
-    swept = 0.5 * _cross(rest, end - origin[mesh.half_edge])
+    swept = 0.5 * cross(rest, end - origin[mesh.half_edge])
     bulge = np.bincount(mesh.half_edge, np.where(begins, 0, swept), n_half)
     chord = np.linalg.norm(target - origin, axis=1)
     return angle_of_area(bulge[half_edge], chord[half_edge])
-
-
-def _cross(p: Float[np.ndarray, "n 2"], q: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import abc
 import importlib
 import importlib.metadata
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import equinox as eqx
 import numpy as np
@@ -18,26 +19,12 @@ from vertax._base.extras import requires_extra
 _SMALLEST_SIDE = 16
 
 
-class AbstractSegmenter(eqx.Module):
-    """Finds the cells of an image.
-
-    Anything callable in this way will do, also one of your own around another segmentation package.
-    """
-
-    @abc.abstractmethod
-    def __call__(
-        self, image: Shaped[np.ndarray | Array, " *shape"]
-    ) -> Int[np.ndarray, "rows columns"]:
-        """Label of each pixel of an image `(rows, columns)`; 0 where there is no cell.
-
-        **Raises:**
-
-        - `ValueError` for an image that cannot be segmented (see
-            [`from_microscopy`][vertax.initialise.from_microscopy]).
-        """
+Segmenter: TypeAlias = Callable[[np.ndarray], np.ndarray]
+"""A function from an image to the label of each pixel, shape `(rows, columns)`, 0 where there is no cell:
+`Watershed()`, `Cellpose()`, or one of your own around another segmentation package."""
 
 
-class Watershed(AbstractSegmenter):
+class Watershed(eqx.Module):
     r"""Watershed of the membrane intensity, one basin a cell; needs no training and no network.
 
     The logarithm of the image is freed from uneven illumination (its local mean and standard
@@ -116,7 +103,7 @@ class Watershed(AbstractSegmenter):
             markers = np.where(small[markers], 0, markers)
 
 
-class Cellpose(AbstractSegmenter):
+class Cellpose(eqx.Module):
     """The neural network Cellpose-SAM (Pachitariu et al. 2025, doi:10.1101/2025.04.28.651001).
 
     Needs cellpose 4, which downloads the weights of its model on first use, and is slow without a

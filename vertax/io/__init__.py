@@ -14,22 +14,12 @@ from vertax.io._edge_table import from_edge_table as from_edge_table
 from vertax.io._force_inference import read_force_inference as read_force_inference
 from vertax.io._geojson import write_geojson as write_geojson
 from vertax.io._image import read_image as read_image, read_stack as read_stack
-from vertax.io._module_file import (
-    load_energy as load_energy,
-    load_problem as load_problem,
-    save_energy as save_energy,
-    save_problem as save_problem,
-)
+from vertax.io._module_file import load as load, save as save
 from vertax.io._pixel_size import pixel_aspect as pixel_aspect, pixel_size as pixel_size
 from vertax.io._read_geojson import read_geojson as read_geojson
 from vertax.io._read_table import read_table as read_table
 from vertax.io._surface_evolver import Foam as Foam, read_surface_evolver as read_surface_evolver
 from vertax.io._tables import Tables as Tables, from_tables as from_tables, to_tables as to_tables
-from vertax.io._tissue_file import load_tissue as load_tissue, save_tissue as save_tissue
-from vertax.io._trajectory import (
-    load_trajectory as load_trajectory,
-    save_trajectory as save_trajectory,
-)
 from vertax.io._tyssue import from_tyssue as from_tyssue
 from vertax.io._vtk import write_vtk as write_vtk
 from vertax.io._vtk_series import write_vtk_series as write_vtk_series

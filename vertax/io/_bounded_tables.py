@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -91,27 +91,33 @@ def without_exterior(
 
 def checked(tables: BoundedTables) -> BoundedTables:
     """The tables as arrays of the right shapes and types."""
-    v, angles, he, faces = (np.asarray(table) for table in tables)
-    if v.ndim != 2 or v.shape[1] != 2 or v.dtype.kind not in "fi" or not np.isfinite(v).all():
-        raise ValueError(
-            "Table `vert_table` must hold finite positions, shape (vertices, 2), but has shape "
-            f"{v.shape} and type {v.dtype}."
-        )
-    if angles.ndim != 1 or angles.dtype.kind not in "fi" or not np.isfinite(angles).all():
-        raise ValueError(
-            "Table `ang_table` must hold finite angles, shape (edges,), but has shape "
-            f"{angles.shape} and type {angles.dtype}."
-        )
-    for name, table, n_columns in (("he_table", he, 8), ("face_table", faces, 2)):
-        if table.ndim != 2 or table.shape[1] != n_columns or table.dtype.kind not in "iu":
-            raise ValueError(
-                f"Table `{name}` must hold integers, shape (rows, {n_columns}), but has shape "
-                f"{table.shape} and type {table.dtype}."
-            )
+    v, angles, he, faces = tables
+    v = checked_table("vert_table", v, "finite positions", "(vertices, 2)")
+    angles = checked_table("ang_table", angles, "finite angles", "(edges,)")
+    he = checked_table("he_table", he, "integers", "(rows, 8)")
+    faces = checked_table("face_table", faces, "integers", "(rows, 2)")
     used = he[:, 3:7]
     if used.size and used.max() >= len(v) + _FIRST_VERTEX:
         raise ValueError(
             f"Table `he_table` is broken: vertices must lie in {_FIRST_VERTEX} … "
             f"{len(v) + _FIRST_VERTEX - 1}."
         )
-    return BoundedTables(v, angles, he.astype(int), faces.astype(int))
+    return BoundedTables(v, angles, he, faces)
+
+
+def checked_table(name: str, table: Any, content: str, shape: str, remedy: str = "") -> np.ndarray:
+    """A table as an array of integers, or of other content. In `shape` a number is the length of an axis."""
+    array = np.asarray(table)
+    axes = [axis for axis in shape[1:-1].split(",") if axis]
+    kinds = "iu" if content == "integers" else "fi"
+    fits = array.ndim == len(axes) and array.dtype.kind in kinds and array.size > 0
+    if (
+        not fits
+        or (len(axes) == 2 and array.shape[1] != int(axes[1]))
+        or not np.isfinite(array).all()
+    ):
+        raise ValueError(
+            f"Table `{name}` must hold {content}, shape {shape}, but has shape {array.shape} and type "
+            f"{array.dtype}.{remedy}"
+        )
+    return array.astype(int) if kinds == "iu" else array

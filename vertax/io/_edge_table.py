@@ -8,8 +8,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from vertax._base.checks import as_float64
 from vertax.initialise._polygons import checked_lattice
@@ -99,15 +97,14 @@ def from_edge_table(
         offset = np.rint((vector - straight) @ np.linalg.inv(lattice)).astype(int)
     offset = np.stack([offset, -offset], axis=1).reshape(-1, 2)
     following = _following(source, face, _directions(vector, angles, vertex), vertex_names)
-    _check_closed(face, offset, following, cell_names)
     twin = np.arange(len(source)) ^ 1
     columns = [np.argsort(following), following, twin, source, target, face, *offset.T]
     face_table = np.unique(face, return_index=True)[1]
     tables = Tables(points, np.stack(columns, axis=1), face_table, 1.0, 1.0)
     frame = np.zeros_like(offset)
-    if box is not None:
-        frame = frames_of(following, face_table, offset, np.bincount(face))
     try:
+        if box is not None:
+            frame = frames_of(following, face_table, offset, np.bincount(face))
         topology = topology_of(tables, frame, exterior=exterior)
     except ValueError as error:
         raise ValueError(
@@ -220,24 +217,3 @@ def _following(
     # After a row that arrives, the face goes on with the row one step clockwise of its twin.
     following[leaving ^ 1] = leaving[:, [2, 0, 1]]
     return following
-
-
-def _check_closed(
-    face: Int[np.ndarray, " rows"],
-    offset: Int[np.ndarray, "rows 2"],
-    following: Int[np.ndarray, " rows"],
-    cell_names: Int[np.ndarray, " cells"],
-) -> None:
-    """Refuse cells in several pieces, or that lead from one image of the box to another."""
-    n = len(face)
-    links = coo_array((np.ones(n, bool), (np.arange(n), following)), shape=(n, n))
-    piece = connected_components(links, directed=False)[1]
-    pieces = np.bincount(face[np.unique(piece, return_index=True)[1]])
-    total = np.stack([np.bincount(face, step) for step in offset.T], axis=1)
-    bad = np.flatnonzero((pieces != 1) | np.any(total != 0, axis=1))
-    if bad.size:
-        name = f"cell {cell_names[bad[0]]}" if bad[0] < len(cell_names) else "the exterior"
-        raise ValueError(
-            f"Argument `table` must list all sides of each cell, but those of {name} make no closed outline. "
-            "Give the rows of all edges, with the `box` of a periodic tissue."
-        )

@@ -1,4 +1,4 @@
-"""Files of tissues, energies and inverse problems: a tree of class names and fields, and the arrays."""
+"""Files of tissues, energies, problems and trajectories: a tree of class names and fields, and the arrays."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import inspect
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
@@ -20,14 +21,11 @@ import optimistix as optx
 
 from vertax._base.archive import as_jax, read_archive, write_archive
 from vertax._base.checks import describe
-from vertax.energies import AbstractEnergy
 from vertax.fitting import InverseProblem
-from vertax.mesh import Arcs, Free, Periodic, Tissue, Topology
-from vertax.transitions import T1, T2, InTurn
+from vertax.io._trajectory import members_of, parts_of
+from vertax.mesh import Periodic, Tissue, Topology, Trajectory
 
 _VERSION = 1
-
-_Module = TypeVar("_Module", bound=eqx.Module)
 
 # The functions that a field may hold, by their names in files.
 _FUNCTIONS: dict[str, Callable] = {
@@ -39,82 +37,38 @@ _FUNCTIONS: dict[str, Callable] = {
     "optimistix.rms_norm": optx.rms_norm,
     "optimistix.two_norm": optx.two_norm,
 }
-# Packages with classes that a file may hold.
-_FAMILIES = (
-    *("activities", "adjoints", "costs", "dissipations", "dynamics", "energies", "external"),
-    *("mechanics", "relax", "solvers", "surfaces"),
-)
 _ODD_FLOATS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
-def save_energy(path: str | os.PathLike[str], energy: AbstractEnergy) -> None:
-    """Save an energy with its parameters to a file, exactly.
+_Content = TypeVar("_Content")
+
+
+def save(path: str | os.PathLike[str], content: eqx.Module | Trajectory) -> None:
+    """Save a tissue, an energy, an inverse problem, a trajectory, or another object of vertax, exactly.
+
+    ```python
+    vx.save("tissue.npz", tissue)
+    vx.save("energy.npz", energy)
+    ```
 
     Arrays keep their bits and their precision, and Python numbers stay Python numbers: a fit adjusts the
     same parameters by default after loading.
 
     The file is a NumPy `.npz` archive without pickles: `format` and `version` (the header), `tree` (the
-    classes and their fields, as JSON), and each array by its place in the tree, such as
-    `data.terms.0.stiffness`. It is written atomically: an interrupted save leaves the old file, if
-    any, as it was.
+    classes and their fields, as JSON), and each array by its place in the tree: `data.vertices`,
+    `data.topology.twin` and others of a tissue, `data.terms.0.stiffness` of a sum of energies. Successive
+    frames of a trajectory with one topology are one batch of tissues, `data.parts.0` and so on, and its
+    values are `data.values.0` and so on. The file is written atomically: an interrupted save leaves the old
+    file, if any, as it was.
 
-    **Arguments:**
-
-    - `path`: the file, by custom with the ending `.npz`; taken as it is.
-    - `energy`: an energy of vertax, one of your classes, or a sum of energies. Fields may hold arrays,
-        keys of random numbers, numbers, text, None, tuples, lists, dictionaries and modules.
-
-    **Raises:**
-
-    - `TypeError` if `energy` is not an energy.
-    - `ValueError`, naming the field, for objects that cannot be stored (functions, for example), and for
-        number types that NumPy does not have.
-    - `OSError` if the file cannot be written.
-    """
-    save_module(path, "energy", energy, AbstractEnergy)
-
-
-def load_energy(
-    path: str | os.PathLike[str], *, classes: Iterable[type[eqx.Module]] = ()
-) -> AbstractEnergy:
-    """Load an energy that [`save_energy`][vertax.io.save_energy] wrote.
-
-    A file holds the names of classes but no code: the classes are those of vertax and those in `classes`.
+    Functions cannot be stored (except the default `trainable` of a problem, and a few of Equinox and
+    Optimistix). So remove a solver such as [`Optax`][vertax.solvers.Optax] before saving, and set it again
+    after loading:
 
     ```python
-    energy = vx.io.load_energy("energy.npz", classes=[Contractility])
-    ```
-
-    **Arguments:**
-
-    - `path`: the file.
-    - `classes`: your classes that the energy contains, identified by their names. Objects are made
-        without calling `__init__`. A field that was added to a class later gets its default.
-
-    **Returns:** the energy, bit for bit as it was saved.
-
-    **Raises:**
-
-    - `FileNotFoundError` if there is no such file.
-    - `ValueError`, with the file's name, if it is not an energy file, is truncated or damaged, was written
-        by a newer version, contains a class that is not in `classes`, or holds 64-bit numbers while JAX is
-        limited to 32 bits (nothing is rounded silently: enable `jax_enable_x64`).
-    """
-    return load_module(path, "energy", AbstractEnergy, classes)
-
-
-def save_problem(path: str | os.PathLike[str], problem: InverseProblem[Any]) -> None:
-    """Save an inverse problem: tissue, energy, cost and settings.
-
-    The format is that of [`save_energy`][vertax.io.save_energy]. A batch of problems for
-    [`fit`][vertax.fit] is saved as one file too.
-
-    Functions cannot be stored (except the default `trainable`, and a few of Equinox and Optimistix). So
-    remove a solver such as [`Optax`][vertax.solvers.Optax] before saving, and set it again after loading:
-
-    ```python
-    vx.io.save_problem("problem.npz", dataclasses.replace(problem, response=vx.Relaxation()))
-    problem = dataclasses.replace(vx.io.load_problem("problem.npz"), response=problem.response)
+    vx.save("problem.npz", dataclasses.replace(problem, response=vx.Relaxation()))
+    loaded = vx.load("problem.npz", vx.InverseProblem)
+    problem = dataclasses.replace(loaded, response=problem.response)
     ```
 
     and write another `trainable` as booleans, `jax.tree.map(trainable, energy)`.
@@ -122,59 +76,66 @@ def save_problem(path: str | os.PathLike[str], problem: InverseProblem[Any]) -> 
     **Arguments:**
 
     - `path`: the file, by custom with the ending `.npz`; taken as it is.
-    - `problem`: the [`InverseProblem`][vertax.InverseProblem].
+    - `content`: an object of a public class of vertax or of one of your subclasses of `equinox.Module`, also
+        a batch; or a [`Trajectory`][vertax.mesh.Trajectory] with at least one frame. Fields may hold arrays,
+        keys of random numbers, numbers, text, None, tuples, lists, dictionaries and modules.
 
-    **Raises:** as [`save_energy`][vertax.io.save_energy].
+    **Raises:**
+
+    - `TypeError` for another object.
+    - `ValueError`, naming the field, for objects that cannot be stored (functions, for example: a
+        [`Graph`][vertax.surfaces.Graph] is one), for number types that NumPy does not have, and for a
+        trajectory without frames.
+    - `OSError` if the file cannot be written.
     """
-    save_module(path, "problem", problem, InverseProblem)
+    if not isinstance(content, eqx.Module | Trajectory):
+        raise TypeError(
+            "Argument `content` must be a tissue, an energy, a problem, a trajectory or another "
+            f"equinox.Module, but is {describe(content)}."
+        )
+    writer = _Writer(content)
+    tree = json.dumps(writer.node(content, ""), allow_nan=False)
+    write_archive(path, "data", _VERSION, {"tree": np.asarray(tree)} | writer.arrays)
 
 
-def load_problem(
-    path: str | os.PathLike[str], *, classes: Iterable[type[eqx.Module]] = ()
-) -> InverseProblem[AbstractEnergy]:
-    """Load an inverse problem that [`save_problem`][vertax.io.save_problem] wrote.
+def load(
+    path: str | os.PathLike[str],
+    kind: type[_Content],
+    *,
+    classes: Iterable[type[eqx.Module]] = (),
+) -> _Content:
+    """Load what [`save`][vertax.io.save] wrote.
+
+    A file holds the names of classes but no code: the classes are those of vertax and those in `classes`.
+
+    ```python
+    tissue = vx.load("tissue.npz", vx.Tissue)
+    energy = vx.load("energy.npz", vx.AbstractEnergy, classes=[Contractility])
+    ```
 
     **Arguments:**
 
     - `path`: the file.
-    - `classes`: classes other than those of vertax (energies, costs, solvers, …), see
-        [`load_energy`][vertax.io.load_energy].
+    - `kind`: the class of the content, or an abstract class of it.
+    - `classes`: your classes in the file, identified by their names: energies, costs, solvers, boundaries,
+        surfaces, …. Objects are made without calling `__init__`. A field that was added to a class later gets
+        its default.
 
-    **Returns:** the [`InverseProblem`][vertax.InverseProblem], bit for bit as it was saved.
+    **Returns:** the object, bit for bit as it was saved.
 
-    **Raises:** as [`load_energy`][vertax.io.load_energy].
+    **Raises:**
+
+    - `FileNotFoundError` if there is no such file.
+    - `ValueError`, with the file's name, if it is not a file of `save`, is truncated or damaged, was written
+        by a newer version, contains an object of another class than `kind`, a class that is not in `classes`
+        or a tissue that contradicts itself, or holds 64-bit numbers while JAX is limited to 32 bits (nothing
+        is rounded silently: enable `jax_enable_x64`).
     """
-    return load_module(path, "problem", InverseProblem, classes)
-
-
-def save_module(
-    path: str | os.PathLike[str],
-    what: str,
-    module: eqx.Module,
-    kind: type[eqx.Module],
-    classes: Iterable[type[eqx.Module]] = (),
-) -> None:
-    """Write a module of a class, with those of `classes` and of `_public_classes` in it.
-
-    `what` is the name of the format, and of the argument in messages.
-    """
-    if not isinstance(module, kind):
-        raise TypeError(
-            f"Argument `{what}` must be of class {kind.__name__}, but is {describe(module)}."
-        )
-    writer = _Writer(what, classes)
-    tree = json.dumps(writer.node(module, ""), allow_nan=False)
-    write_archive(path, what, _VERSION, {"tree": np.asarray(tree)} | writer.arrays)
-
-
-def load_module(
-    path: str | os.PathLike[str],
-    what: str,
-    kind: type[_Module],
-    classes: Iterable[type[eqx.Module]],
-) -> _Module:
-    """Read what `save_module` wrote."""
     name = os.fspath(path)
+    if not isinstance(kind, type):
+        raise TypeError(
+            f"Argument `kind` must be a class, such as vx.Tissue, but is {describe(kind)}."
+        )
     user_classes: dict[str, type[eqx.Module]] = {}
     if isinstance(classes, type) or not isinstance(classes, Iterable):
         raise TypeError(
@@ -191,44 +152,49 @@ def load_module(
                 f"Argument `classes` holds two classes of the name {cls.__name__}, which a file cannot "
                 "distinguish. Rename one."
             )
-    arrays = read_archive(path, what, _VERSION)
+    arrays = read_archive(path, "data", _VERSION)
     try:
         tree = json.loads(str(arrays.get("tree", "")))
-        module = _Reader(name, arrays, user_classes).node(tree, what)
+        content = _Reader(name, arrays, user_classes).node(tree, "content")
     except (json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"{name} is broken: its `tree` cannot be read ({error}).") from error
-    if not isinstance(module, kind):
+    if not isinstance(content, kind):
         raise ValueError(
-            f"{name} is broken: it must hold a module of class {kind.__name__}, but holds one of class "
-            f"{type(module).__name__}."
+            f"Argument `kind` must be the class of the content of {name}, {type(content).__name__}, or a "
+            f"base class, but is {kind.__name__}."
         )
-    return module
+    return content
+
+
+def _name_of(cls: type) -> str | None:
+    """The name of a public class of vertax in files, such as `energies.LineTension`."""
+    package, *path = cls.__module__.split(".")
+    # (`solvers.Scales` is defined below the solvers.)
+    family = "solvers" if path[:1] == ["_base"] else "".join(path[:1])
+    name = f"{family}.{cls.__name__}"
+    return name if package == "vertax" and _class_of(name) is cls else None
 
 
 @functools.cache
-def _public_classes() -> dict[str, type[eqx.Module]]:
-    """The classes of vertax by their names in files."""
-    single = (Arcs, Free, InTurn, InverseProblem, Periodic, T1, T2, Tissue, Topology)
-    classes: dict[str, type[eqx.Module]] = {cls.__name__: cls for cls in single}
-    for family in _FAMILIES:
-        for name, cls in vars(importlib.import_module(f"vertax.{family}")).items():
-            if (
-                isinstance(cls, type)
-                and issubclass(cls, eqx.Module)
-                and not inspect.isabstract(cls)
-            ):
-                classes[f"{family}.{name}"] = cls
-    return classes
+def _class_of(name: str) -> type[eqx.Module] | None:
+    """The public class of vertax with a name in files."""
+    family, _, name = name.partition(".")
+    if not re.fullmatch("[a-z]+", family):
+        return None
+    try:
+        cls = getattr(importlib.import_module(f"vertax.{family}"), name, None)
+    except ImportError:
+        return None
+    is_module = isinstance(cls, type) and issubclass(cls, eqx.Module)
+    return cls if is_module and not inspect.isabstract(cls) else None
 
 
 class _Writer:
     """Convert modules to JSON, and collect their arrays."""
 
-    def __init__(self, argument: str, classes: Iterable[type[eqx.Module]] = ()):
-        self.argument = argument
-        self.classes = tuple(classes)
+    def __init__(self, content: eqx.Module | Trajectory):
+        self.is_problem = isinstance(content, InverseProblem)
         self.arrays: dict[str, np.ndarray] = {}
-        self.names = {cls: name for name, cls in _public_classes().items()}
 
     def node(self, value: Any, path: str) -> Any:
         if value is None or type(value) in (bool, int, str):
@@ -252,19 +218,23 @@ class _Writer:
             return self.array("scalar", value, path)
         if isinstance(value, eqx.Module):
             return self.module(value, path)
+        if isinstance(value, Trajectory):
+            parts = self.node(parts_of(value), f"{path}.parts")
+            values = self.node(value.values, f"{path}.values")
+            return {"kind": "trajectory", "parts": parts, "values": values}
         for name, function in _FUNCTIONS.items():
             if value is function:
                 return {"kind": "function", "name": name}
         what = "a function" if inspect.isroutine(value) else f"of type {type(value).__name__}"
         raise ValueError(
-            f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is {what}, which has no place "
+            f"Argument `content` cannot be saved: its `{path[1:]}` is {what}, which has no place "
             f"in a file. {self.remedy(path)}"
         )
 
     def remedy(self, path: str) -> str:
-        if self.argument == "problem" and path.startswith(".trainable"):
+        if self.is_problem and path.startswith(".trainable"):
             return "Give booleans: dataclasses.replace(problem, trainable=jax.tree.map(trainable, energy))."
-        if self.argument == "problem" and path.startswith(".response"):
+        if self.is_problem and path.startswith(".response"):
             return (
                 "Save dataclasses.replace(problem, response=vx.Relaxation()), and give the response again "
                 "after loading."
@@ -276,7 +246,7 @@ class _Writer:
         # NumPy would read bfloat16 and similar types as raw bytes.
         if not isinstance(dtype, np.dtype) or dtype.kind not in "biufc":
             raise ValueError(
-                f"Argument `{self.argument}` must hold numbers of a NumPy type, but its "
+                "Argument `content` must hold numbers of a NumPy type, but its "
                 f"`{path[1:]}` is {dtype}. Convert it before saving, such as to float32."
             )
         name = f"data{path}"
@@ -285,13 +255,12 @@ class _Writer:
 
     def module(self, module: eqx.Module, path: str) -> dict[str, Any]:
         cls = type(module)
-        name = self.names.get(cls)
-        of_vertax = cls.__module__.split(".")[0] == "vertax"
-        if name is None and of_vertax and cls not in self.classes:
+        name = _name_of(cls)
+        if name is None and cls.__module__.split(".")[0] == "vertax":
+            part = f"its `{path[1:]}`" if path else "it"
             raise ValueError(
-                f"Argument `{self.argument}` cannot be saved: its `{path[1:]}` is of class {cls.__name__}, "
-                f"which is not an energy, cost, adjoint, solver or other part of a problem. "
-                f"{self.remedy(path)}"
+                f"Argument `content` cannot be saved: {part} is of class {cls.__name__}, which is not a "
+                f"public one of vertax. {self.remedy(path)}"
             )
         held = vars(module)
         names = [field.name for field in dataclasses.fields(cls) if field.name in held]
@@ -335,6 +304,9 @@ class _Reader:
                 return self.array(name)[()]
             case {"kind": "function", "name": str(name)} if name in _FUNCTIONS:
                 return _FUNCTIONS[name]
+            case {"kind": "trajectory", "parts": parts, "values": values}:
+                values = self.node(values, f"{path}.values")
+                return self.trajectory(self.node(parts, f"{path}.parts"), values)
             case {"kind": "vertax" | "own" as kind, "class": str(name), "fields": dict(fields)}:
                 return self.module(self.find(kind, name, path), fields, path)
         raise ValueError(
@@ -358,12 +330,13 @@ class _Reader:
 
     def find(self, kind: str, name: str, path: str) -> type[eqx.Module]:
         if kind == "vertax":
-            if name not in _public_classes():
+            cls = _class_of(name)
+            if cls is None:
                 raise ValueError(
                     f"{self.file} contains {name} of vertax (at `{path}`), which this version does not have. "
                     "Update vertax."
                 )
-            return _public_classes()[name]
+            return cls
         if name not in self.user_classes:
             raise ValueError(
                 f"{self.file} holds an object of the class {name} (at `{path}`), which is not one of "
@@ -400,6 +373,21 @@ class _Reader:
             f"{self.file} has no field `{field.name}` (at `{path}`) of the class {cls.__name__}, which has "
             "no default: it was written with another version of that class."
         )
+
+    def trajectory(self, parts: Any, values: Any) -> Trajectory:
+        trajectory = Trajectory()
+        try:
+            parts = jax.tree.map(lambda x: as_jax(x, self.file), parts)
+            frames = [frame for part in parts for frame in members_of(part)]
+            for frame in frames:
+                check_tissue(frame)
+            for k, frame in enumerate(frames):
+                trajectory.append(frame, **{key: column[k] for key, column in values.items()})
+            if any(len(column) != len(frames) for column in values.values()):
+                raise ValueError(f"its values are not those of {len(frames)} frames")
+        except Exception as error:  # of NumPy and JAX, for arrays that do not fit
+            raise ValueError(f"{self.file} is broken: {error}") from error
+        return trajectory
 
     def check(self, module: eqx.Module, path: str) -> None:
         """Check tissues and topologies: JAX raises no error for an index that is out of range."""

@@ -13,7 +13,6 @@ from jaxtyping import ArrayLike, Float, Shaped
 
 from vertax.initialise import PolygonTissue
 from vertax.initialise._faces import Names
-from vertax.initialise._nearby_corners import size_of_cells
 from vertax.initialise._polygons import tissue_from_near_corners
 from vertax.io._read_table import properties, read_features
 
@@ -67,8 +66,6 @@ def read_geojson(
     corner = np.concatenate(rings)
     cells = np.split(np.arange(len(corner)), np.cumsum([len(ring) for ring in rings])[:-1])
     images = [np.zeros((len(ring), 2), int) for ring in rings]
-    if tolerance is None:
-        tolerance = 1e-6 * size_of_cells(corner[:, :2], cells, images, None)
     names = Names(
         f"The polygons of {path}", _at(corner), lambda cell: f"feature {features[cell]['number']}"
     )
@@ -79,6 +76,7 @@ def read_geojson(
         tolerance,
         box=box,
         images=None if box is None else images,
+        relative_tolerance=1e-6,
         inner_arcs=inner_arcs,
         softening=softening,
     )

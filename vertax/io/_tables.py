@@ -11,7 +11,13 @@ from jaxtyping import Float, Int
 
 from vertax._base.checks import check_number, describe
 from vertax._base.model_checks import check_planar
-from vertax.io._bounded_tables import BoundedTables, checked, with_exterior, without_exterior
+from vertax.io._bounded_tables import (
+    BoundedTables,
+    checked,
+    checked_table,
+    with_exterior,
+    without_exterior,
+)
 from vertax.io._data_tables import check_single
 from vertax.mesh import Free, Periodic, Tissue, Topology
 
@@ -189,12 +195,10 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
         box is sheared or its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
     check_single(tissue)
-    check_planar("tables, which have two coordinates (save_tissue keeps the surface)", tissue)
+    check_planar("tables, which have two coordinates (save keeps the surface)", tissue)
     tissue = tissue.without_spare()
     if tissue.inner_arcs:
-        raise ValueError(
-            "Tables hold arcs on the outline only. Use `save_tissue`, which keeps all."
-        )
+        raise ValueError("Tables hold arcs on the outline only. Use `vx.save`, which keeps all.")
     boundary = tissue.boundary
     if isinstance(boundary, Free):
         angles = np.asarray(tissue.edge_angles if tissue.angles is None else tissue.angles)
@@ -208,7 +212,7 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
     if lattice[0, 1] != 0 or lattice[1, 0] != 0:
         raise ValueError(
             "Tables hold rectangular boxes only (lattice vectors along x and y), but the lattice "
-            f"is {lattice.tolist()}. Use `save_tissue`, which keeps any lattice."
+            f"is {lattice.tolist()}. Use `vx.save`, which keeps any lattice."
         )
     size = np.diag(lattice)
     m = tissue.topology
@@ -244,26 +248,13 @@ def _rows(m: Topology, offset: Int[np.ndarray, "halfedges 2"]) -> Int[np.ndarray
 
 def _checked(tables: Tables) -> Tables:
     """The tables as arrays of the right shapes and types."""
-    v, he, f = (np.asarray(table) for table in tables[:3])
     check_number("width", _number(tables.width), above=0)
     check_number("height", _number(tables.height), above=0)
-    width, height = float(tables.width), float(tables.height)
-    if v.ndim != 2 or v.shape[1] != 2 or v.dtype.kind not in "fi" or not np.isfinite(v).all():
-        raise ValueError(
-            "Table `vert_table` must hold finite positions, shape (vertices, 2), but has shape "
-            f"{v.shape} and type {v.dtype}."
-        )
-    if he.ndim != 2 or he.shape[1] != 8 or he.dtype.kind not in "iu":
-        raise ValueError(
-            "Table `he_table` must hold integers, shape (half-edges, 8), but has shape "
-            f"{he.shape} and type {he.dtype}."
-        )
-    if f.ndim != 1 or f.size == 0 or f.dtype.kind not in "iu":
-        raise ValueError(
-            f"Table `face_table` must hold integers, shape (faces,), but has shape {f.shape} and "
-            f"type {f.dtype}. (For bounded tissues pass `BoundedTables`.)"
-        )
-    return Tables(v, he.astype(int), f.astype(int), width, height)
+    v = checked_table("vert_table", tables.vert_table, "finite positions", "(vertices, 2)")
+    he = checked_table("he_table", tables.he_table, "integers", "(half-edges, 8)")
+    remedy = " (For bounded tissues pass `BoundedTables`.)"
+    f = checked_table("face_table", tables.face_table, "integers", "(faces,)", remedy)
+    return Tables(v, he, f, float(tables.width), float(tables.height))
 
 
 def _number(value: Any) -> Any:

@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Int
 from vertax._base.checks import as_float64, describe
 from vertax.initialise import PolygonTissue
 from vertax.initialise._faces import Names
-from vertax.initialise._polygons import on_surface_through, tissue_from_corners
+from vertax.initialise._polygons import tissue_from_corners
 from vertax.io._read_table import column, read_table, whole_numbers
 
 _TABLES = ("vert", "edge", "face")
@@ -107,10 +107,8 @@ def from_tyssue(
         lambda point: f"vertex {vert_numbers[point]}",
         lambda cell: f"face {face_numbers[cell]}",
     )
-    build = lambda flat: tissue_from_corners(
-        flat, cells, names, box=box, inner_arcs=inner_arcs, softening=softening
-    )
-    result = on_surface_through(points, build, names)
+    settings = {"box": box, "inner_arcs": inner_arcs, "softening": softening}
+    result = tissue_from_corners(points, cells, names, **settings)
     side_edges = np.empty(len(order), int)
     side_edges[order] = result.side_edges
     return dataclasses.replace(result, side_edges=side_edges)

@@ -35,7 +35,7 @@ class Trajectory(Sequence[Tissue]):
     ```python
     trajectory = vx.mesh.Trajectory(every=10)
     vx.fit(problem, optimiser, epochs=200, callback=trajectory)
-    vx.io.save_trajectory("fit.npz", trajectory)
+    vx.save("fit.npz", trajectory)
     for tissue, cost in zip(trajectory, trajectory.values["cost"]):
         ...
     ```

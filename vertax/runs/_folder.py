@@ -34,7 +34,7 @@ from vertax.fitting import (
     fit_warnings,
     stack_fits,
 )
-from vertax.io import save_tissue, write_csv
+from vertax.io import save, write_csv
 from vertax.mesh import Tissue
 from vertax.runs._sections import Fitting
 from vertax.runs._tables import file_name, history_table, plain, sentence
@@ -328,7 +328,7 @@ class RunFolder:
 
     def save_tissue(self, name: str, tissue: Tissue) -> None:
         """Write a tissue to `name.npz`."""
-        save_tissue(self.path / f"{name}.npz", tissue)
+        save(self.path / f"{name}.npz", tissue)
 
     def save_array(self, name: str, array: Shaped[np.ndarray, "..."]) -> None:
         """Write an array to `name.npy`."""

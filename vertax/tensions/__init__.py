@@ -9,6 +9,7 @@ from vertax.tensions._inferred import (
     MotionFit as MotionFit,
 )
 from vertax.tensions._mask import read_mask as read_mask
+from vertax.tensions._mean_stress import MeanStress as MeanStress
 from vertax.tensions._tensions_of_masks import (
     TensionsOfMasks as TensionsOfMasks,
     infer_tensions_of_masks as infer_tensions_of_masks,

@@ -27,18 +27,14 @@ from vertax._base.checks import check_choice
 from vertax._base.pixels import pixel_length, pixel_sides
 from vertax._base.tasks import map_tasks
 from vertax._base.threads import num_threads
-from vertax.initialise import MaskChange, MaskReport
-from vertax.io import append_parquet, write_csv, write_rows
-from vertax.io._module_file import load_module, save_module
+from vertax.io import append_parquet, load, save, write_csv, write_rows
 from vertax.tensions._columns import column_descriptions
 from vertax.tensions._find_masks import MaskFrame, MaskSource, find_masks
 from vertax.tensions._infer_tensions import infer_tensions
-from vertax.tensions._inferred import CurvedGeometry, InferredTensions
-from vertax.tensions._mean_stress import MeanStress
+from vertax.tensions._inferred import InferredTensions
 
 _TABLES = ("cells", "edges", "changes", "frames")
 _MASKS_PER_PART = 64
-_CLASSES = (InferredTensions, CurvedGeometry, MeanStress, MaskReport, MaskChange)
 
 
 class TensionsOfMasks(eqx.Module):
@@ -140,15 +136,12 @@ class TensionsOfMasks(eqx.Module):
             yield TensionsOfMasks(results, failures, self.length_unit)
 
 
-_load = partial(load_module, what="tensions", kind=InferredTensions, classes=_CLASSES)
-
-
 class _Stored(UserDict[str | int, Any]):
     """Results in the files of a cache, each read when it is used."""
 
     def __getitem__(self, name: str | int) -> InferredTensions:
         result = self.data[name]
-        return _load(result) if isinstance(result, Path) else result
+        return load(result, InferredTensions) if isinstance(result, Path) else result
 
 
 @announce_compilations("measurements of a tissue")
@@ -226,7 +219,7 @@ def infer_tensions_of_masks(
                 failures[frame.name] = str(error)
                 continue
             if entry is not None:
-                save_module(entry, "tensions", result, InferredTensions, _CLASSES)
+                save(entry, result)
             results[frame.name] = result if entry is None else entry
     # In the order of the masks, not of the threads.
     order = [frame.name for frame in frames]
@@ -267,7 +260,7 @@ def _entry_name(frame: MaskFrame, options: Mapping[str, Any]) -> str:
 def _is_stored(entry: Path, frame: MaskFrame) -> bool:
     """Whether the result is in the cache and can be read."""
     try:
-        return entry.exists() and _load(entry) is not None
+        return entry.exists() and load(entry, InferredTensions) is not None
     except ValueError as error:  # truncated or damaged
         text = f"The entry of the cache for {frame.name} is computed anew: {error}"
         warnings.warn(text, stacklevel=4)
