@@ -15,7 +15,7 @@ LINES = {
     "dissipations": 293,
     "dynamics": 1024,
     "energies": 676,
-    "external": 2043,
+    "external": 2041,
     "fitting": 2025,
     "growth": 825,
     "inference": 2274,
