@@ -22,7 +22,7 @@ from vertax.adjoints import AbstractAdjoint, EquilibriumPropagation
 from vertax.energies import AbstractEnergy
 from vertax.energies._scales import scales_of
 from vertax.external._external_gradient import ExternalEquilibrium, attach_gradient, force_of
-from vertax.external._host import Job, Request, run_jobs, stack_results
+from vertax.external._host import Job, Request, run_jobs, stack_results, with_result
 from vertax.external._simulator import AbstractSimulator, Ledger, Relaxed, SimulatorError, ledger_of
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Equilibrium
@@ -270,11 +270,7 @@ def _relax_externally(
 ) -> Equilibrium:
     start, constant = frozen((tissue, energy))
     result = frozen(response.run_simulator(Request(start, constant, None, None), throw))
-    relaxed = eqx.tree_at(
-        lambda t: (t.vertices, t.topology), start, (result.vertices, result.topology)
-    )
-    if result.angles is not None:
-        relaxed = relaxed.with_angles(result.angles)
+    relaxed = with_result(start, result)
     scales = response.scales(relaxed, constant)
     slope_by_energy = response.slope == "energy"
     # For a program the rigid motions without stiffness are unknown: assume all of them.

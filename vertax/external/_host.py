@@ -60,11 +60,7 @@ class Job(NamedTuple):
         changed = np.any(np.asarray(topology.twin) != tissue.topology.twin)
         if forces is not None and changed:
             raise SimulatorError("The program changed the topology of a tissue that was nudged.")
-        slope = None
-        if self.slope != "energy":
-            relaxed_tissue = _with_result(tissue, topology, vertices, angles)
-            slope = _slope(self, relaxed, relaxed_tissue, energy)
-        return relaxed._replace(
+        result = relaxed._replace(
             vertices=vertices,
             topology=topology,
             angles=angles,
@@ -72,8 +68,12 @@ class Job(NamedTuple):
             max_force=np.asarray(relaxed.max_force, vertices.dtype),
             num_steps=np.asarray(relaxed.num_steps, np.int32),
             num_t1=np.asarray(relaxed.num_t1, np.int32),
-            slope=slope,
+            slope=None,
         )
+        if self.slope == "energy":
+            return result
+        slope = _slope(self, relaxed, with_result(tissue, result), energy)
+        return result._replace(slope=slope)
 
 
 def run_jobs(
@@ -212,11 +212,13 @@ def _differences(job: Job, tissue: Tissue, energy: Any) -> PyTree[np.ndarray]:
     return jax.tree.unflatten(structure, slopes)
 
 
-def _with_result(tissue: Tissue, topology: Any, vertices: np.ndarray, angles: Any) -> Tissue:
-    moved = eqx.tree_at(lambda t: (t.vertices, t.topology), tissue, (vertices, topology))
-    if angles is None:
+def with_result(tissue: Tissue, result: Relaxed) -> Tissue:
+    """The tissue with vertices, topology and angles of a result."""
+    parts = result.vertices, result.topology
+    moved = eqx.tree_at(lambda t: (t.vertices, t.topology), tissue, parts)
+    if result.angles is None:
         return moved
-    return eqx.tree_at(lambda t: t.arcs.angles, moved, angles)
+    return eqx.tree_at(lambda t: t.arcs.angles, moved, result.angles)
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...]) -> Shaped[np.ndarray, "..."]:
