@@ -20,7 +20,7 @@ LINES = {
     "growth": 825,
     "inference": 2295,
     "initialise": 3819,
-    "io": 3628,
+    "io": 3611,
     "jobs": 935,
     "mechanics": 2251,
     "mesh": 2933,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2296,
     "surfaces": 630,
     "tensions": 4355,
-    "tests": 31911,
+    "tests": 31869,
     "transitions": 1327,
 }
 # Largest number of lines of a file, and of the files that have more.
