@@ -27,7 +27,7 @@ LINES = {
     "plotting": 2168,
     "precondition": 716,
     "relax": 2134,
-    "runs": 1996,
+    "runs": 1993,
     "signals": 559,
     "solvers": 2296,
     "surfaces": 630,
