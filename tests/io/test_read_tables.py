@@ -185,6 +185,12 @@ def test_tables_that_are_no_edges_are_refused():
         vx.io.from_edge_table(table, box=(4, 4))
     with pytest.raises(ValueError, match="`box` is needed for a periodic tissue"):
         vx.io.from_edge_table(vx.io.edge_table(PERIODIC))
+    for factor, message in (
+        (1.5, "`box` must be the box of the table"),
+        (0.5, "cover the box once"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vx.io.from_edge_table(vx.io.edge_table(PERIODIC), box=factor * BOX)
     swapped = table | {"left_cell": table["right_cell"], "right_cell": table["left_cell"]}
     with pytest.raises(ValueError, match=r"-1 only on the right, but row \d+ has -1"):
         vx.io.from_edge_table(swapped)

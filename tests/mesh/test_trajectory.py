@@ -274,14 +274,6 @@ class TestFile:
             save(path, Trajectory())
         assert os.listdir(path.parent) == []
 
-    @pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.999])
-    def test_truncated_files_are_rejected(self, relaxation, path, kept):
-        save(path, relaxation[-1])
-        content = path.read_bytes()
-        path.write_bytes(content[: int(kept * len(content))])
-        with pytest.raises(ValueError, match=r"trajectory\.npz is truncated or damaged"):
-            load(path, vx.mesh.Trajectory)
-
     def test_other_files_are_rejected(self, relaxation, path):
         with pytest.raises(FileNotFoundError):
             load(path, vx.mesh.Trajectory)

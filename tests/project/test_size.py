@@ -20,7 +20,7 @@ LINES = {
     "growth": 817,
     "inference": 2295,
     "initialise": 3819,
-    "io": 3628,
+    "io": 3611,
     "jobs": 935,
     "mechanics": 2185,
     "mesh": 2484,

@@ -54,7 +54,7 @@ def from_edge_table(
 
     - `ValueError`, naming the column, edge, cell or vertex, for a column that is missing or has the wrong
         type, vertices that do not join three edges, cells that are not closed, for a periodic tissue without
-        `box`, and for arcs, a box or overhangs in a table with z.
+        its `box`, and for arcs, a box or overhangs in a table with z.
     """
     read = lambda name: whole_numbers(table, name, "table")
     cells = np.stack([read("left_cell"), read("right_cell")], axis=1)
@@ -95,6 +95,12 @@ def from_edge_table(
     if box is not None:
         straight = points[vertex[:, 1]] - points[vertex[:, 0]]
         offset = np.rint((vector - straight) @ np.linalg.inv(lattice)).astype(int)
+        rest = np.linalg.norm(vector - straight - offset @ lattice, axis=1)
+        if rest.max() > 1e-2 * np.sqrt(np.linalg.det(lattice)):
+            raise ValueError(
+                f"Argument `box` must be the box of the table, but edge {int(np.argmax(rest))} and another "
+                f"one at its end are not a lattice vector of {lattice.tolist()} apart. Correct `box`."
+            )
     offset = np.stack([offset, -offset], axis=1).reshape(-1, 2)
     following = _following(source, face, _directions(vector, angles, vertex), vertex_names)
     twin = np.arange(len(source)) ^ 1
@@ -104,7 +110,7 @@ def from_edge_table(
     frame = np.zeros_like(offset)
     try:
         if box is not None:
-            frame = frames_of(following, face_table, offset, np.bincount(face))
+            frame = frames_of(tables, lattice)
         topology = topology_of(tables, frame, exterior=exterior)
     except ValueError as error:
         raise ValueError(

@@ -110,24 +110,15 @@ def from_tables(tables: Tables | BoundedTables, *, softening: float | None = Non
             f"{describe(tables)}. Write Tables(vert_table, he_table, face_table, width, height)."
         )
     tables = _checked(tables)
-    vert_table, he_table, face_table, width, height = tables
     _check_rows(tables)
-    following, face = he_table[:, 1], he_table[:, 5]
-    frame = frames_of(following, face_table, he_table[:, 6:], np.bincount(face))
-    topology = topology_of(tables, frame, exterior=False)
-    # The faces of a torus cover it a whole number of times, whatever their shapes: -1 if they all
-    # run clockwise, and something else if offsets are wrong in a way that happens to close around
-    # each face. (Shoelace formula, in NumPy: it would be a dozen small compilations.)
-    x, y = (vert_table[he_table[:, 3]] + frame * [width, height]).T
-    cover = 0.5 * np.sum(x * y[following] - y * x[following]) / (width * height)
-    if abs(cover - 1) > 1e-2:
-        raise ValueError(
-            "The faces of `he_table` must run counter-clockwise and cover the box once, but their "
-            f"signed areas sum to {cover:.3g} boxes."
-        )
-    dtype = _dtype(vert_table)
-    lattice = jnp.asarray(np.diag([width, height]), dtype)
-    return Tissue(jnp.asarray(vert_table, dtype), topology, Periodic(lattice), softening)
+    lattice = np.diag([tables.width, tables.height])
+    topology = topology_of(tables, frames_of(tables, lattice), exterior=False)
+    dtype = _dtype(tables.vert_table)
+    vertices, boundary = (
+        jnp.asarray(tables.vert_table, dtype),
+        Periodic(jnp.asarray(lattice, dtype)),
+    )
+    return Tissue(vertices, topology, boundary, softening)
 
 
 def _from_bounded_tables(tables: BoundedTables, softening: float | None) -> Tissue:
@@ -313,16 +304,16 @@ def _check_rows(tables: Tables) -> None:
     )
 
 
-def frames_of(
-    following: np.ndarray, start: np.ndarray, offset: np.ndarray, sides: np.ndarray
-) -> np.ndarray:
-    """Box of each row's source, relative to the first row of its face (`start`).
+def frames_of(tables: Tables, lattice: Float[np.ndarray, "2 2"]) -> Int[np.ndarray, "halfedges 2"]:
+    """Box of each row's source, relative to the first row of its face, in a lattice that faces cover once.
 
     Sums the offsets around all faces at once, one side at a time.
     """
+    he_table, start = tables.he_table, tables.face_table
+    following, offset = he_table[:, 1], he_table[:, 6:]
     frame = np.zeros_like(offset)
     row, image = start, np.zeros((len(start), 2), offset.dtype)
-    for _ in range(sides.max()):
+    for _ in range(np.bincount(he_table[:, 5]).max()):
         frame[row] = image
         image = image + offset[row]
         row = following[row]
@@ -334,4 +325,14 @@ def frames_of(
                 "Table `he_table` is broken: offsets must add up to zero around every face (first "
                 f"offenders: faces {broken[:3].tolist()})."
             )
+    # The faces of a torus cover it a whole number of times, whatever their shapes: -1 if they all
+    # run clockwise, and something else if offsets are wrong in a way that happens to close around
+    # each face. (Shoelace formula, in NumPy: it would be a dozen small compilations.)
+    x, y = (tables.vert_table[he_table[:, 3]] + frame @ lattice).T
+    cover = 0.5 * np.sum(x * y[following] - y * x[following]) / np.linalg.det(lattice)
+    if abs(cover - 1) > 1e-2:
+        raise ValueError(
+            "The faces of `he_table` must run counter-clockwise and cover the box once, but their "
+            f"signed areas sum to {cover:.3g} boxes."
+        )
     return frame

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import functools
 import importlib
@@ -105,7 +106,7 @@ def apply_overrides(data: Mapping[str, Any], overrides: Iterable[str]) -> dict[s
 
     A value is written as in TOML; any other text is a string. The last override of a key is used.
     """
-    config = _copy(data)
+    config = copy.deepcopy(dict(data))
     for override in overrides:
         key, equals, text = override.partition("=")
         *tables, name = parts = [part.strip() for part in key.split(".")]
@@ -252,10 +253,6 @@ def _merge(below: Mapping[str, Any], above: Any) -> Any:
         return above
     nested = {k: _merge(below[k], v) for k, v in above.items() if isinstance(below.get(k), Mapping)}
     return {**below, **above, **nested}
-
-
-def _copy(data: Any) -> Any:
-    return {key: _copy(value) for key, value in data.items()} if isinstance(data, Mapping) else data
 
 
 def _in_toml(value: Any) -> str:
