@@ -269,7 +269,7 @@ def _relax_externally(
     throw: bool,
 ) -> Equilibrium:
     start, constant = frozen((tissue, energy))
-    result = frozen(response.run_simulator(Request(start, constant, None, None), throw))
+    result: Any = frozen(response.run_simulator(Request(start, constant, None, None), throw))
     relaxed = with_result(start, result)
     scales = response.scales(relaxed, constant)
     slope_by_energy = response.slope == "energy"
