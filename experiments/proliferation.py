@@ -268,7 +268,7 @@ def plot_monolayer(table: dict[str, np.ndarray]) -> Any:
     figure, ((left, middle, right),) = plotting.new_figure(1, 3, width=2.4)
     cycles, cells = table["cycles"], table["cells"]
     left.semilogy(cycles, cells, color=SERIES[0], base=2, label="grown")
-    left.semilogy(cycles, cells[0] * 2**cycles, ":", color=INK, lw=0.9, base=2, label="2 per cycle")
+    left.semilogy(cycles, cells[0] * 2**cycles, ":", color=INK, lw=0.9, base=2, label="2× per cycle")
     left.set(xlabel="time in cycles", ylabel="cells")
     left.legend()
     middle.plot(cycles, table["radius"], color=SERIES[0])
