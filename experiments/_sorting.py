@@ -22,7 +22,7 @@ PUBLISHED = {
     "engulfment": {0: 10.97, 10: 10.14, 100: 9.72, 500: 9.26, 1000: 9.23},
     "mixing": {0: 10.97, 10: 14.28, 100: 15.09, 500: 14.98, 1000: 14.88},
 }
-"""Length of unlike contacts by time, one run of Chaste each (github.com/jmosborne/OpenVt2026Workshop)."""
+"""Length of unlike contacts by time, one run of Chaste each (repository `OpenVt2026Workshop` on GitHub)."""
 
 
 class Model(runs.Section):

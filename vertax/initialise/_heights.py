@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vertax._base.checks import check_number
+from vertax._base.checks import check_number, check_shape
 from vertax._base.pixels import pixel_length, pixel_sides
 from vertax.mesh import Periodic, geometry_of
 from vertax.surfaces import AbstractSurface, HeightMap
@@ -36,11 +36,9 @@ def surface_of(
         return height
     check_number("plane_distance", plane_distance, above=0)
     heights, tissue = np.asarray(height), source.tissue
-    if heights.shape != source.image_shape:
-        raise ValueError(
-            f"Argument `height` must have the shape of the mask, {source.image_shape}, but has "
-            f"{heights.shape}. Pass the heights of the same pixels."
-        )
+    check_shape(
+        "height", heights, source.image_shape, remedy="Pass the heights of the same pixels."
+    )
     pixel = pixel_length(source.pixel_size)
     stepped = len(np.unique(heights)) < _STEPS * heights.size
     width = _SMOOTHING_OF_STEPS if stepped else _SMOOTHING

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from vertax._base.checks import check_concrete, check_number
+from vertax._base.checks import check_choice, check_concrete, check_number
 from vertax._base.pixels import PixelSize, as_pixel_size, pixel_sides
 from vertax.initialise._cracks import Mesh, crack_graph
 from vertax.initialise._gaps import (
@@ -171,10 +171,7 @@ def from_labels(
     """
     check_concrete("from_labels", mask, pixel_size)
     check_options(boundary, pixel_size)
-    if holes not in _HOLES:
-        raise ValueError(
-            f"Argument `holes` must be one of {', '.join(map(repr, _HOLES))}, but is {holes!r}."
-        )
+    check_choice("holes", holes, _HOLES)
     if gap_width is not None:
         check_number("gap_width", gap_width, at_least=0)
     values, image, background = checked_mask(mask, background)

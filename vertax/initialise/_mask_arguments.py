@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Int, Integer, Shaped
 from scipy.ndimage import label as connected_regions
 
-from vertax._base.checks import check_integer
+from vertax._base.checks import check_choice, check_integer
 from vertax._base.pixels import PixelSize, check_pixel_size
 from vertax.initialise._pieces import connected_pieces
 
@@ -26,11 +26,7 @@ _BOUNDARIES = ("mirrored", "periodic", "free")
 
 def check_options(boundary: str, pixel_size: PixelSize | None) -> None:
     """Raise a `ValueError` for an unknown boundary or an impossible pixel size."""
-    if boundary not in _BOUNDARIES:
-        raise ValueError(
-            f"Argument `boundary` must be one of {', '.join(map(repr, _BOUNDARIES))}, but is "
-            f"{boundary!r}."
-        )
+    check_choice("boundary", boundary, _BOUNDARIES)
     if pixel_size is not None:
         check_pixel_size("pixel_size", pixel_size)
 

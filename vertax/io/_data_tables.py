@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from vertax._base.atomic import atomic_write
-from vertax._base.checks import check_concrete, describe
+from vertax._base.checks import check_concrete, check_instance, describe
 from vertax._base.extras import requires_extra
+from vertax._base.model_checks import check_single
 from vertax.mesh import Drawing, Tissue, pad
 
 Column: TypeAlias = Array | np.ndarray | Sequence[Any]
@@ -47,7 +48,7 @@ def cell_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray
         another column.
     - `TypeError` if `tissue` is not a tissue, and inside `jax.jit` or `jax.vmap`.
     """
-    check_single(tissue)
+    check_writable(tissue)
     return cell_columns(tissue, Drawing(tissue), columns)
 
 
@@ -66,7 +67,7 @@ def edge_table(tissue: Tissue, **columns: Column) -> dict[str, Shaped[np.ndarray
 
     **Raises:** as [`cell_table`][vertax.io.cell_table].
     """
-    check_single(tissue)
+    check_writable(tissue)
     return edge_columns(tissue, Drawing(tissue), columns)
 
 
@@ -220,16 +221,10 @@ def edge_columns(
     return {name: column[drawing.alive_edges] for name, column in table.items()}
 
 
-def check_single(tissue: Tissue) -> None:
+def check_writable(tissue: Tissue) -> None:
     """Raise an error unless `tissue` is one concrete tissue."""
-    if not isinstance(tissue, Tissue):
-        raise TypeError(f"Argument `tissue` must be a vertax.Tissue, but is {describe(tissue)}.")
-    if tissue.vertices.ndim != 2:
-        raise ValueError(
-            "Argument `tissue` must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}. Write the members of a batch one by one: "
-            "jax.tree.map(lambda x: x[0], tissue) is the first."
-        )
+    check_instance("tissue", tissue, Tissue, "a vertax.Tissue")
+    check_single(tissue, "Write its members, e.g. vertax.fitting.member(tissue, 0), one by one.")
     check_concrete("A function that writes a tissue", tissue)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from vertax._base.atomic import atomic_write
 from vertax._base.checks import check_integer, describe
 from vertax._base.model_checks import check_planar
-from vertax.io._data_tables import Column, cell_columns, check_single, edge_columns
+from vertax.io._data_tables import Column, cell_columns, check_writable, edge_columns
 from vertax.mesh import Drawing, Tissue
 
 
@@ -86,7 +86,7 @@ def write_geojson(
 
 def checked_drawing(tissue: Tissue, points_per_arc: int) -> Drawing:
     """The geometry of one tissue, for files; checks the arguments."""
-    check_single(tissue)
+    check_writable(tissue)
     check_integer("points_per_arc", points_per_arc, at_least=1)
     return Drawing(tissue, points_per_arc)
 

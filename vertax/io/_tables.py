@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vertax._base.checks import check_number, describe
+from vertax._base.checks import check_instance, check_number
 from vertax._base.model_checks import check_planar
 from vertax.io._bounded_tables import (
     BoundedTables,
@@ -18,7 +18,7 @@ from vertax.io._bounded_tables import (
     with_exterior,
     without_exterior,
 )
-from vertax.io._data_tables import check_single
+from vertax.io._data_tables import check_writable
 from vertax.mesh import Free, Periodic, Tissue, Topology
 
 
@@ -104,11 +104,8 @@ def from_tables(tables: Tables | BoundedTables, *, softening: float | None = Non
     """
     if isinstance(tables, BoundedTables):
         return _from_bounded_tables(tables, softening)
-    if not isinstance(tables, Tables):
-        raise TypeError(
-            "Argument `tables` must be vertax.io.Tables or BoundedTables, but is "
-            f"{describe(tables)}. Write Tables(vert_table, he_table, face_table, width, height)."
-        )
+    remedy = "Write Tables(vert_table, he_table, face_table, width, height)."
+    check_instance("tables", tables, Tables, "vertax.io.Tables or BoundedTables", remedy)
     tables = _checked(tables)
     _check_rows(tables)
     lattice = np.diag([tables.width, tables.height])
@@ -185,7 +182,7 @@ def to_tables(tissue: Tissue) -> Tables | BoundedTables:
     - `ValueError` for a batch of tissues, for a tissue on a surface, for arcs that tables cannot hold, if the
         box is sheared or its first vector is not along x, or an edge reaches beyond the neighbouring box.
     """
-    check_single(tissue)
+    check_writable(tissue)
     check_planar("tables, which have two coordinates (save keeps the surface)", tissue)
     tissue = tissue.without_spare()
     if tissue.inner_arcs:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from vertax._base.checks import check_number
+from vertax._base.checks import check_number, check_shape
 from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
 from vertax.plotting._tissue import plot_tissue, single
@@ -109,8 +109,7 @@ def plot_mode(
 def _shaped(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """The values as an array; raise an error unless it has the given shape."""
     array = np.asarray(values, float)
-    if array.shape != shape:
-        raise ValueError(f"Argument `{name}` must have shape {shape}, but has {array.shape}.")
+    check_shape(name, array, shape)
     return array
 
 

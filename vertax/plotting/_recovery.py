@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from vertax._base.checks import check_shape
 from vertax.inference import pearson, relative_error
 from vertax.plotting import _style
 
@@ -63,11 +64,8 @@ def plot_recovery(
     others: dict[str, Any] = {"initial": initial, "deviation": deviation}
     others = {key: None if v is None else np.asarray(v, float) for key, v in others.items()}
     for argument, values in {"inferred": inferred, **others}.items():
-        if values is not None and values.shape != true.shape:
-            raise ValueError(
-                f"Argument `{argument}` must have the shape of `true`, {true.shape}, but has "
-                f"{values.shape}."
-            )
+        if values is not None:
+            check_shape(argument, values, true.shape)
     if true.ndim != 1 or true.size == 0:
         raise ValueError(
             f"Argument `true` must hold a list of at least one parameter, but has shape "

@@ -13,6 +13,8 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from vertax._base.checks import check_shape
+from vertax._base.model_checks import check_single
 from vertax._base.pixels import PixelSizeLike
 from vertax.mesh import Drawing, Tissue
 from vertax.plotting import _style
@@ -116,11 +118,7 @@ def plot_tissue(
 
 def single(tissue: Tissue) -> Tissue:
     """The tissue; raise an error if it is a batch."""
-    if tissue.vertices.ndim != 2:
-        raise ValueError(
-            "Argument `tissue` must be a single tissue, but its vertices have shape "
-            f"{tissue.vertices.shape}."
-        )
+    check_single(tissue)
     return tissue
 
 
@@ -232,8 +230,7 @@ def checked(name: str, values: Any, n: int) -> np.ndarray | None:
     if values is None:
         return None
     values = np.asarray(values)
-    if values.shape != (n,):
-        raise ValueError(f"Argument `{name}` must have shape ({n},), but has {values.shape}.")
+    check_shape(name, values, (n,))
     return values
 
 

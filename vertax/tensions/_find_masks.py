@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Array, Shaped
 
-from vertax._base.checks import describe
+from vertax._base.checks import check_instance
 from vertax.io import read_stack
 from vertax.tensions._infer_tensions import infer_tensions, pixels_of_file
 from vertax.tensions._inferred import InferredTensions
@@ -93,11 +93,9 @@ def find_masks(
                 f"is {masks.shape}."
             )
         return [MaskFrame(*frame) for frame in enumerate(planes)]
-    if not isinstance(masks, Sequence):
-        raise TypeError(
-            "Argument `masks` must be a folder, a pattern, a file, an array or a list of these, but is "
-            f"{describe(masks)}."
-        )
+    check_instance(
+        "masks", masks, Sequence, "a folder, a pattern, a file, an array or a list of these"
+    )
     if not len(masks):
         raise ValueError("Argument `masks` must hold at least one mask, but is empty.")
     named = iter(_named([Path(m) for m in masks if isinstance(m, str | os.PathLike)]))
