@@ -264,6 +264,7 @@ def test_solvers_with_line_searches_are_not_unrolled():
     assert vx.solvers.Optax(optax.polyak_sgd()).unrollable
 
 
+@pytest.mark.thorough
 def test_unrolled_gradient_from_a_start_at_rest():
     at = start_and_cost()
     unrolled = evaluate(*at, vx.AutomaticDifferentiation(), MOMENTUM)
@@ -360,6 +361,7 @@ def test_order_of_the_estimators_of_equilibrium_propagation():
     assert error(1e-4, True) < 0.1 * error(1e-4, False)
 
 
+@pytest.mark.thorough
 def test_default_nudge_is_independent_of_the_scale_of_the_cost():
     tissue, energy, cost = start_and_cost()
     for weight in (1e-9, 1.0, 1e9):

@@ -54,6 +54,7 @@ class TestEquilibria:
         assert not equilibrium.tissue.overlaps.any
         assert floats(equilibrium) == {"float32"}
 
+    @pytest.mark.thorough
     def test_free_tissue_with_arcs_reaches_rest(self):
         tissue = cluster(6, 1)
         energy = AreaElasticity(5.0, 1.0) + LineTension(0.5)
@@ -68,6 +69,7 @@ class TestEquilibria:
             pytest.param(vx.solvers.FIRE(), id="fire", marks=pytest.mark.thorough),
         ],
     )
+    @pytest.mark.thorough
     def test_other_solvers_reach_the_same_energy(self, rest, solver):
         tissue, energy = rest
         shaken = tissue.with_vertices(tissue.vertices.at[0].add(0.05))
@@ -167,6 +169,7 @@ class TestFits:
 
 
 class TestMechanics:
+    @pytest.mark.thorough
     def test_moduli_of_hexagons_have_their_closed_forms(self, hexagons):
         tissue, energy = hexagons
         c, p0 = float(jnp.sqrt(8 * jnp.sqrt(3.0))), 3.4
@@ -253,6 +256,7 @@ class TestInputAndOutput:
         again = vx.io.from_tables(vx.io.to_tables(tissue))
         np.testing.assert_allclose(np.sort(again.areas), np.sort(tissue.areas), atol=1e-5)
 
+    @pytest.mark.thorough
     def test_tensions_of_a_foam_are_recovered(self):
         energy = AreaElasticity(20.0, jnp.linspace(0.9, 1.2, 14))
         tissue = cluster(14, 3, lloyd_steps=3, inner_arcs=True)
@@ -305,6 +309,7 @@ class TestSurfacesSignalsAndMovies:
         np.testing.assert_allclose(np.sum(after * movie.tissue.areas), amount, rtol=1e-5)
         assert np.ptp(after[:N]) < 0.8 * np.ptp(before[:N])
 
+    @pytest.mark.thorough
     def test_a_movie_is_read_from_its_table(self, rest):
         moved = rest[0].with_vertices(rest[0].vertices + 0.4)  # corners leave the box
         table = table_of(rows_of(rest[0], 0) + rows_of(moved, 1))
@@ -313,6 +318,7 @@ class TestSurfacesSignalsAndMovies:
 
 
 class TestTransitions:
+    @pytest.mark.thorough
     def test_division_and_removal_keep_areas(self):
         tissue = random_tissue(N, 1).with_capacity(N + 1)
         divided = vx.transitions.divide(tissue, 2).tissue
@@ -331,6 +337,7 @@ class TestTransitions:
         ],
         ids=["vertices", "areas", "shape"],
     )
+    @pytest.mark.thorough
     def test_costs_have_finite_gradients(self, rest, make):
         tissue, energy = rest
         cost = make(tissue)

@@ -406,6 +406,7 @@ def test_error_of_a_fit_names_an_invalid_gradient_and_not_the_relaxation(hidden)
         assert "No epoch" not in str(error.value)
 
 
+@pytest.mark.thorough
 def test_error_of_a_fit_names_parameters_and_forces_that_are_not_finite(hidden):
     target, _, guess, start = hidden
 
@@ -465,6 +466,7 @@ OPTIMISERS = {
         ),
     ],
 )
+@pytest.mark.thorough
 def test_optimisers_with_keys_masks_and_several_steps(hidden, name, tmp_path):
     target, _, guess, start = hidden
     problem, optimiser = (
@@ -506,6 +508,7 @@ def test_optimisers_that_need_more_than_the_gradient_are_rejected(hidden, make, 
         vx.fit(stacked, make(guess), 2, batched=True, progress=False)
 
 
+@pytest.mark.thorough
 def test_members_without_a_valid_epoch_have_failed(hidden):
     target, _, guess, start = hidden
     one_step = dataclasses.replace(FIXED_TOPOLOGY, max_steps=1)

@@ -43,6 +43,7 @@ def test_areas_on_a_tilted_plane(mask, sized):
     np.testing.assert_allclose(flat.vertices, with_arcs.tissue.vertices, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_a_surface_has_the_period_of_the_mask(mask):
     wave = 3 * np.sin(2 * np.pi * (np.arange(N) + 0.5) / N) + np.zeros((N, 1))
     periodic = from_labels(mask, boundary="periodic", height=wave, pixel_size=0.1).tissue
@@ -102,6 +103,7 @@ def test_heights_that_do_not_fit_are_rejected(mask, options, error, message):
         from_labels(mask, boundary="periodic", **options)
 
 
+@pytest.mark.thorough
 def test_a_micrograph_with_heights_is_a_tissue_on_a_surface():
     tissue = vx.initialise.periodic_voronoi(16, key=1, lloyd_steps=2)
     image = vx.inference.Microscope(pixels=96, psf_width=1.5)(tissue, key=jax.random.key(0))

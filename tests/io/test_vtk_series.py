@@ -41,6 +41,7 @@ def test_bad_input(tmp_path, movie, without_type_checks):
         write_vtk_series(tmp_path / "movie.pvd", movie, cells={"strain": np.zeros(6)})
 
 
+@pytest.mark.thorough
 def test_a_series_is_read_as_a_movie(tmp_path):
     pytest.importorskip("meshio")
     tissue = vx.initialise.periodic_voronoi(16, key=0)

@@ -46,6 +46,7 @@ def test_sparse_and_dense_hessians_agree():
     assert sparse_hessian(Landscape(large, spring)) is None
 
 
+@pytest.mark.thorough
 def test_sparse_hessian_of_a_tissue_with_spare_slots():
     from vertax.mechanics._hessian import sparse_hessian
     from vertax.mechanics._landscape import Landscape

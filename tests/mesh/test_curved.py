@@ -64,6 +64,7 @@ def test_areas_agree_with_a_fine_integration(flat, height, error):
     assert float(jnp.sum(tissue.areas)) == pytest.approx(exact.sum(), rel=error / 10)
 
 
+@pytest.mark.thorough
 def test_areas_on_a_cap_converge_to_those_of_the_sphere():
     # The same cluster with cells of half the size has a quarter of the curvature: the error falls by 2⁴.
     cluster, errors = free_cluster(20), []
@@ -73,6 +74,7 @@ def test_areas_on_a_cap_converge_to_those_of_the_sphere():
     assert np.all(np.diff(np.log2(errors)) < -3.7)
 
 
+@pytest.mark.thorough
 def test_a_round_cluster_on_a_cap_has_the_area_of_the_cap():
     # The whole cap up to the polar angle θ has the area 2 π R² (1 - cos θ).
     cluster = free_cluster(120)
@@ -131,6 +133,7 @@ def test_measurements_do_not_depend_on_the_image_of_the_box(flat, surface):
     np.testing.assert_allclose(moved.edge_lengths, tissue.edge_lengths, rtol=1e-11)
 
 
+@pytest.mark.thorough
 def test_areas_are_continuous_in_a_transition(flat):
     tissue = flat.with_surface(bump(0.75))
     frames = EdgeFrames(tissue)

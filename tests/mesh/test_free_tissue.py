@@ -45,6 +45,7 @@ def geometry(tissue):
 
 @few
 @given(clusters, st.floats(0, 6.3), st.floats(-30, 30))
+@pytest.mark.thorough
 def test_geometry_is_invariant_under_rigid_motions(recipe, angle, x):
     tissue = recipe()
     before, after = geometry(tissue), geometry(rotated(tissue, angle, (x, -0.3 * x)))

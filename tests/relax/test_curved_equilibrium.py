@@ -87,6 +87,7 @@ def test_translations_are_zero_modes_only_where_the_surface_is_homogeneous(flat,
     assert (float(jnp.max(jnp.abs(drift))) < 1e-12) == free
 
 
+@pytest.mark.thorough
 def test_the_energy_of_a_tube_approaches_that_of_the_plane_with_second_order(flat):
     energy = elastic(jnp.ones(2))
     plane = float(FIXED_TOPOLOGY(flat, energy).energy)

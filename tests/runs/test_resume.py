@@ -145,6 +145,7 @@ def test_a_finished_run_is_not_resumed(finished):
     assert "is finished: there is nothing to resume" in outcome.stderr
 
 
+@pytest.mark.thorough
 def test_resume_goes_with_no_other_folder(finished, stopped):
     for other in (["--overwrite"], ["--output", "x"]):
         outcome = vertax("run", finished / "tiny.toml", "--resume", stopped, *other)

@@ -95,6 +95,7 @@ def test_radii_grow_fast_where_predictions_are_right():
     assert needed(fn, start, 1e-4) <= needed(fn, start) + 5  # 11 doublings
 
 
+@pytest.mark.thorough
 def test_radii_do_not_grow_where_steps_were_shortened():
     """The model predicted those steps well, and would propose them again without end."""
     solver: Any = vx.solvers.NewtonCG()

@@ -59,6 +59,7 @@ def test_height_maps_interpolate_the_pixels(periodic):
     np.testing.assert_allclose(heights_of(surface, centres), 2 * HEIGHTS, atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_height_maps_converge_with_the_fourth_power_of_the_pixel_size():
     wave = lambda x: np.sin(np.pi * x[..., 0] / 4) * np.cos(np.pi * x[..., 1] / 4)
     x = RNG.uniform(0, 8, size=(500, 2))

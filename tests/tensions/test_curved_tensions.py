@@ -61,6 +61,7 @@ def lifted(on_sphere):
     return infer_tensions(mask, height=heights, pixel_size=0.5, plane_distance=0.5)
 
 
+@pytest.mark.thorough
 def test_equal_tensions_on_a_sphere_are_equal(on_sphere, lifted):
     assert 0.7 < curved(lifted).slopes.max() < 1.5
     spread = lambda result: np.std(result.tensions[result.determined])

@@ -86,6 +86,7 @@ def test_finished_masks_are_read_from_the_cache(mask, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("format", ["csv", "parquet"])
+@pytest.mark.thorough
 def test_tables_in_parts_are_one_table(mask, tmp_path, monkeypatch, format):
     if format == "parquet":
         pytest.importorskip("pyarrow", reason="needs PyArrow, of the extra [cluster]")
