@@ -7,7 +7,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 # Largest numbers of lines of Python, with comments and docstrings.
 LINES = {
-    "_base": 3567,
+    "_base": 3568,
     "activities": 436,
     "adjoints": 974,
     "bayes": 1079,
@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2205,
     "surfaces": 629,
     "tensions": 4191,
-    "tests": 31905,
+    "tests": 31911,
     "transitions": 1578,
 }
 # Largest number of lines of a file, and of the files that have more.

@@ -142,7 +142,8 @@ class TestExchange:
             lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, random_tissue(6, 0)
         )
         start = jnp.linspace(1, 2, 12, dtype=jnp.float32).reshape(2, 6)
-        concentrations = after(Signals(Turnover(0.5), [0.1, 0.2], initial=start), tissue, 0.5)
+        signals = Signals(Turnover(0.5), [0.1, 0.2], initial=start, rtol=1e-10)  # below rounding
+        concentrations = after(signals, tissue, 0.5)
         assert concentrations.dtype == jnp.float32
         double = after(Signals(Turnover(0.5), [0.1, 0.2], initial=start), random_tissue(6, 0), 0.5)
         np.testing.assert_allclose(concentrations, double, rtol=3e-5)
@@ -469,7 +470,7 @@ class TestErrors:
             evolve(Signals(Flat(), [0.1], initial=[1.0]))
         with pytest.raises(TypeError, match=r"`Foreign` must use jax\.numpy"):
             evolve(Signals(Foreign(), [0.1], initial=[1.0]))
-        with pytest.raises(ValueError, match=r"`initial` must have one entry for each of 6 cells"):
+        with pytest.raises(ValueError, match=r"`initial` must have shape .* or \(1, 6\)"):
             evolve(Signals(None, [0.1], initial=jnp.ones((1, 5))))
         number: Any = lambda c, tissue: c
         with pytest.raises(TypeError, match="`couple` must return an energy"):

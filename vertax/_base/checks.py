@@ -124,7 +124,8 @@ def check_shape(name: str, value: Any, *shapes: tuple[int, ...], remedy: str = "
     shape = np.shape(value)
     if shape not in shapes:
         allowed = ["be one number"] if () in shapes else []
-        allowed += [f"have shape {each}" for each in shapes if each]
+        arrays = " or ".join(str(each) for each in shapes if each)
+        allowed += [f"have shape {arrays}"] if arrays else []
         fact = f"Argument `{name}` must {' or '.join(allowed)}, but its shape is {shape}."
         raise ValueError(f"{fact} {remedy}".rstrip())
 

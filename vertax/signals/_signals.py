@@ -16,6 +16,7 @@ from vertax._base.checks import (
     check_instance,
     check_integer,
     check_number,
+    check_shape,
     describe,
 )
 from vertax._base.extras import requires_extra
@@ -88,7 +89,8 @@ class Signals(AbstractActivity):
         species that are bound to the membrane: their concentration stays constant in the motion of the tissue
         and is copied in a division.
     - `solver`: a solver of Diffrax, `diffrax.Tsit5()` by default. For stiff reactions `diffrax.Kvaerno3()`.
-    - `rtol`, `atol`: tolerances of the concentrations in each step of the tissue.
+    - `rtol`, `atol`: tolerances of the concentrations in each step of the tissue; `rtol` is raised to 4 times
+        the rounding of their data type.
     - `max_steps`: maximum number of inner steps per step of the tissue.
     - `deterministic`: False if `couple` returns an activity that draws random numbers. Then a key is needed.
 
@@ -162,14 +164,11 @@ class Signals(AbstractActivity):
 
     def init(self, tissue: Tissue, key: PRNGKeyArray) -> SignalState:
         """The initial amounts, and the initial state of a coupled activity."""
-        n = tissue.n_cells
-        if self.initial.ndim == 2 and self.initial.shape[1] != n:
-            raise ValueError(
-                f"Argument `initial` must have one entry for each of {n} cells (spare slots included), shape "
-                f"({len(self.diffusion)}, {n}), but has shape {self.initial.shape}."
-            )
+        n, n_species, dtype = tissue.n_cells, len(self.diffusion), tissue.vertices.dtype
+        remedy = "Give one row per species, with one entry per cell (spare slots included)."
+        check_shape("initial", self.initial, (n_species,), (n_species, n), remedy=remedy)
         initial = self.initial if self.initial.ndim == 2 else self.initial[:, None]
-        initial = jnp.broadcast_to(initial, (len(self.diffusion), n)).astype(tissue.vertices.dtype)
+        initial = jnp.broadcast_to(initial, (n_species, n)).astype(dtype)
         check_reaction(self.reaction, initial, tissue)
         amounts = self._from_amounts(initial * _areas(tissue), tissue)
         activity = _activity(self._material(amounts, tissue))
@@ -284,6 +283,7 @@ class Signals(AbstractActivity):
             return (relative_areas * reacting + flux).astype(amounts.dtype)
 
         start = self.record(state, tissue) * relative_areas
+        rtol = jnp.maximum(self.rtol, 4 * jnp.finfo(start.dtype).eps)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(rates),
             self.solver,
@@ -291,7 +291,7 @@ class Signals(AbstractActivity):
             dt,
             None,
             start,
-            stepsize_controller=diffrax.PIDController(self.rtol, self.atol),
+            stepsize_controller=diffrax.PIDController(rtol, self.atol),
             max_steps=self.max_steps,
             throw=False,
         )
