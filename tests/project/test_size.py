@@ -7,20 +7,20 @@ import pytest
 ROOT = Path(__file__).parents[2]
 # Largest numbers of lines of Python, with comments and docstrings.
 LINES = {
-    "_base": 3568,
+    "_base": 3601,
     "activities": 436,
     "adjoints": 974,
     "bayes": 1079,
     "costs": 1619,
     "dissipations": 287,
-    "dynamics": 1011,
+    "dynamics": 1003,
     "energies": 660,
     "external": 2038,
     "fitting": 2018,
     "growth": 817,
     "inference": 2274,
-    "initialise": 3810,
-    "io": 3603,
+    "initialise": 3785,
+    "io": 3602,
     "jobs": 935,
     "mechanics": 2185,
     "mesh": 2484,
@@ -40,7 +40,7 @@ LINES_OF_A_FILE = 400
 LONG_FILES = {
     "fitting/_inverse.py": 417,
     "initialise/_labels.py": 418,
-    "initialise/_polygons.py": 581,
+    "initialise/_polygons.py": 563,
     "io/_module_file.py": 432,
     "mesh/_tissue.py": 616,
     "mesh/_topology.py": 343,

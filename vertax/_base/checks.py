@@ -235,6 +235,24 @@ def as_matrix(name: str, value: ArrayLike, *, symmetric: bool = False) -> Float[
     return matrix
 
 
+def as_lattice(box: ArrayLike | Sequence[Any]) -> Float[np.ndarray, "2 2"]:
+    """Convert the argument `box` to two lattice vectors; a `ValueError` for another shape or area."""
+    lattice = as_float64("box", box)
+    if lattice.shape == (2,):
+        lattice = np.diag(lattice)
+    if lattice.shape != (2, 2):
+        raise ValueError(
+            "Argument `box` must be width and height, or two lattice vectors as rows, shape (2, 2), but has "
+            f"shape {lattice.shape}."
+        )
+    if not np.linalg.det(lattice) > 0:
+        raise ValueError(
+            "Argument `box` must have a positive area, its second vector counter-clockwise of its first, but "
+            f"its area is {np.linalg.det(lattice):.3g}. Give positive sides, or swap the vectors."
+        )
+    return lattice
+
+
 def as_float64(name: str, value: ArrayLike | Sequence[Any]) -> Shaped[np.ndarray, "..."]:
     """Convert to a NumPy array of finite float64 numbers, also if JAX is limited to 32 bits.
 

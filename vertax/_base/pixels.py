@@ -72,3 +72,10 @@ def pixel_length(pixel_size: Any) -> float:
     **Returns:** the length.
     """
     return float(np.sqrt(np.prod(pixel_sides(pixel_size))))
+
+
+def without_single_axes(image: np.ndarray) -> np.ndarray:
+    """An image without the axes of length 1 that a third and further axes are."""
+    while image.ndim > 2 and 1 in image.shape:
+        image = np.squeeze(image, axis=image.shape.index(1))
+    return image

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 from vertax._base.tracing import is_concrete
 
@@ -202,3 +202,11 @@ class AbstractOutcome(eqx.Module):
     def _details(self) -> str:
         """Details of the failure for the message."""
         return ""
+
+
+def finite_record(record: PyTree[Array]) -> RESULTS:
+    """`signals_not_finite` if an array that an activity records is not finite."""
+    finite = jnp.array(True)
+    for leaf in jax.tree.leaves(record):
+        finite &= jnp.all(jnp.isfinite(leaf))
+    return RESULTS.where(finite, RESULTS.successful, RESULTS.signals_not_finite)

@@ -7,14 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from vertax._base.checks import as_real, check_number
+from vertax._base.checks import as_real, check_number, check_shape
 from vertax._base.model_checks import check_planar
 from vertax.activities._activity import AbstractActivity
 from vertax.activities._noise import safe_sqrt
 from vertax.activities._push import Push
 from vertax.dissipations import AbstractDissipation
 from vertax.energies import AbstractEnergy
-from vertax.energies._energy import per_cell
 from vertax.mesh import Tissue
 
 
@@ -93,9 +92,10 @@ class SelfPropulsion(AbstractActivity):
         noise = jax.random.normal(key, angles.shape, angles.dtype)
         angles = angles + alignment + safe_sqrt(2 * self.rotational_diffusion * dt) * noise
         direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-        force_per_vertex = jnp.broadcast_to(
-            per_cell(self.force, tissue, "force"), angles.shape
-        ) / jnp.maximum(m.neighbour_counts, 1)
+        remedy = "Give one number, or one for each cell."
+        check_shape("force", self.force, (), angles.shape, remedy=remedy)
+        force_per_vertex = jnp.broadcast_to(self.force, angles.shape)
+        force_per_vertex = force_per_vertex / jnp.maximum(m.neighbour_counts, 1)
         at_corners = (
             (force_per_vertex[:, None] * direction).at[m.cell].get(mode="fill", fill_value=0)
         )

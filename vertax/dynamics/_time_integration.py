@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vertax._base.checks import describe
 from vertax._base.frame_loop import AbstractSimulation, Frame
-from vertax._base.results import RESULTS, first_failure, result_of
+from vertax._base.results import RESULTS, finite_record, first_failure, result_of
 from vertax._base.tracing import frozen, tree_where
 from vertax.adjoints import AbstractAdjoint
 from vertax.dissipations import AbstractDissipation, AbstractViscosity
@@ -295,14 +295,6 @@ def max_force(active_energy: AbstractEnergy, tissue: Tissue) -> Float[Array, ""]
     forces = jax.grad(lambda x: active_energy(tissue.with_vertices(x)))(tissue.vertices)
     largest = jnp.max(jnp.sum(forces**2, axis=-1))
     return jnp.sqrt(jnp.maximum(largest, jnp.finfo(largest.dtype).tiny))
-
-
-def finite_record(record: PyTree[Array]) -> RESULTS:
-    """`signals_not_finite` if an array that an activity records is not finite."""
-    finite = jnp.array(True)
-    for leaf in jax.tree.leaves(record):
-        finite &= jnp.all(jnp.isfinite(leaf))
-    return RESULTS.where(finite, RESULTS.successful, RESULTS.signals_not_finite)
 
 
 def _folded(boundary: AbstractBoundary) -> Bool[Array, ""]:

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from vertax._base.frame_loop import AbstractSimulation, Frame
-from vertax._base.results import RESULTS, first_failure, result_of
+from vertax._base.results import RESULTS, finite_record, first_failure, result_of
 from vertax._base.tracing import tree_where
 from vertax.activities import AbstractActivity
 from vertax.adjoints import AbstractAdjoint
 from vertax.dissipations import AbstractDissipation
 from vertax.dynamics._incremental_potential import IncrementalPotential
-from vertax.dynamics._time_integration import finite_record, max_force
+from vertax.dynamics._time_integration import max_force
 from vertax.energies import AbstractEnergy
 from vertax.growth._grown import Grown
 from vertax.growth._life_cycle import AbstractLifeCycle

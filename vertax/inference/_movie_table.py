@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from vertax._base.checks import as_float64, check_number
+from vertax._base.checks import as_float64, as_lattice, check_number
 from vertax.inference._movie import Movie, Repair
 from vertax.inference._movie_polygons import Numbering, Polygons, check_given, polygons_of
 from vertax.initialise import PolygonTissue
 from vertax.initialise._nearby_corners import build_within, share_corners
-from vertax.initialise._polygons import checked_lattice, tissue_from_corners
+from vertax.initialise._polygons import tissue_from_corners
 from vertax.io import read_table
 from vertax.io._read_table import column, whole_numbers
 
@@ -85,7 +85,7 @@ def movie_from_table(
     read = lambda name: as_float64("table", column(table, name, "table"))
     times = read("time") if "time" in names else frame
     given = {name: read(name) for name in _GIVEN if name in names}
-    lattice = None if box is None else checked_lattice(box)
+    lattice = None if box is None else as_lattice(box)
     tissues, numbers, moments, filled, repairs, nodes = [], [], [], [], [], []
     last_seen: dict[int, np.ndarray] = {}
     numbering = Numbering(lattice, largest_jump)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int, Integer, Shaped
 from scipy.ndimage import label as connected_regions
 
 from vertax._base.checks import check_choice, check_integer
-from vertax._base.pixels import PixelSize, check_pixel_size
+from vertax._base.pixels import PixelSize, check_pixel_size, without_single_axes
 from vertax.initialise._pieces import connected_pieces
 
 # A picture has at least this number of connected regions, more than half of its pixels in regions of fewer
@@ -78,13 +78,6 @@ def checked_mask(
         )
     image = image.reshape(mask.shape).astype(np.int32) - n_gaps
     return values.astype(np.int64), np.maximum(image, -1), background
-
-
-def without_single_axes(image: np.ndarray) -> np.ndarray:
-    """An image without the axes of length 1 that a third and further axes are."""
-    while image.ndim > 2 and 1 in image.shape:
-        image = np.squeeze(image, axis=image.shape.index(1))
-    return image
 
 
 def check_bits(name: str, mask: Integer[np.ndarray, "rows columns"]) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from vertax._base.checks import as_float64, check_concrete, check_number, describe
+from vertax._base.checks import as_float64, as_lattice, check_concrete, check_number, describe
 from vertax.initialise._faces import FaceMesh, Names, Sides, build_faces
 from vertax.initialise._nearby_corners import build_within, cross, share_corners, size_of_cells
 from vertax.initialise._overlap_repair import crossed_by, repair_overlaps
@@ -405,25 +405,7 @@ def _checked_box(
         raise ValueError(
             "Argument `images` must come with `box`, but there is none. Pass the box of the periodic tissue."
         )
-    return None if box is None else checked_lattice(box)
-
-
-def checked_lattice(box: ArrayLike | Sequence[Any]) -> Float[np.ndarray, "2 2"]:
-    """The two lattice vectors of a box."""
-    lattice = as_float64("box", box)
-    if lattice.shape == (2,):
-        lattice = np.diag(lattice)
-    if lattice.shape != (2, 2):
-        raise ValueError(
-            "Argument `box` must be width and height, or two lattice vectors as rows, shape (2, 2), but has "
-            f"shape {lattice.shape}."
-        )
-    if not np.linalg.det(lattice) > 0:
-        raise ValueError(
-            "Argument `box` must have a positive area, its second vector counter-clockwise of its first, but "
-            f"its area is {np.linalg.det(lattice):.3g}. Give positive sides, or swap the vectors."
-        )
-    return lattice
+    return None if box is None else as_lattice(box)
 
 
 def _checked_open(

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from vertax._base.checks import as_float64
-from vertax.initialise._polygons import checked_lattice
+from vertax._base.checks import as_float64, as_lattice
 from vertax.io._read_table import column, whole_numbers
 from vertax.io._tables import Tables, frames_of, topology_of
 from vertax.mesh import Free, Periodic, Tissue
@@ -83,7 +82,7 @@ def from_edge_table(
             "read by "
             "`vx.initialise.from_polygons`."
         )
-    lattice = np.zeros((2, 2)) if box is None else checked_lattice(box)
+    lattice = np.zeros((2, 2)) if box is None else as_lattice(box)
     points = _positions(vertex, ends, None if box is None else lattice)
 
     # Row 2 e of the paper's half-edge table runs along edge e, row 2 e + 1 against it.

@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label
 
 from vertax._base.checks import check_choice, check_integer
+from vertax._base.pixels import without_single_axes
 from vertax.initialise._mask_arguments import (
     check_bits,
     check_no_picture,
     check_zero,
-    without_single_axes,
 )
 from vertax.initialise._pieces import connected_pieces
 from vertax.io._image import read_colours
