@@ -243,7 +243,7 @@ class TestTissue:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            ({"cells": np.zeros(14)}, r"`cells` must have shape \(15,\), but has \(14,\)"),
+            ({"cells": np.zeros(14)}, r"`cells` must have shape \(15,\), but its shape is \(14,\)"),
             ({"cells": np.zeros((15, 3))}, r"`cells`.*\(15, 3\)"),
             ({"edges": np.zeros(15)}, r"`edges` must have shape \(45,\)"),
             ({"mask": np.zeros(3, bool)}, r"`mask` must have shape \(15,\)"),
@@ -340,7 +340,9 @@ class TestHistory:
         assert panel.get_yscale() == "linear"
 
     def test_the_history_of_a_batch_is_refused(self):
-        with pytest.raises(ValueError, match=r"`history` must have shape \(4,\), but has \(4, 2\)"):
+        with pytest.raises(
+            ValueError, match=r"`history` must have shape \(4,\), but its shape is \(4, 2\)"
+        ):
             plot_history(self.history(np.ones((4, 2))))
 
 
@@ -404,7 +406,7 @@ class TestRecovery:
         assert plt.get_fignums() == []
 
     def test_wrong_arguments(self):
-        with pytest.raises(ValueError, match="`inferred` must have the shape of `true`"):
+        with pytest.raises(ValueError, match=r"`inferred` must have shape .* each entry of `true`"):
             plot_recovery(self.TRUE, np.ones(3))
         with pytest.raises(ValueError, match="`initial` must have the shape of `true`"):
             plot_recovery(self.TRUE, self.TRUE, np.ones(3))

@@ -65,7 +65,8 @@ def plot_recovery(
     others = {key: None if v is None else np.asarray(v, float) for key, v in others.items()}
     for argument, values in {"inferred": inferred, **others}.items():
         if values is not None:
-            check_shape(argument, values, true.shape)
+            remedy = "Give one for each entry of `true`."
+            check_shape(argument, values, true.shape, remedy=remedy)
     if true.ndim != 1 or true.size == 0:
         raise ValueError(
             f"Argument `true` must hold a list of at least one parameter, but has shape "
