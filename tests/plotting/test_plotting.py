@@ -410,7 +410,9 @@ class TestRecovery:
             plot_recovery(self.TRUE, np.ones(3))
         with pytest.raises(ValueError, match=r"`initial` must have shape .* each entry of `true`"):
             plot_recovery(self.TRUE, self.TRUE, np.ones(3))
-        with pytest.raises(ValueError, match=r"`deviation` must have shape .* each entry of `true`"):
+        with pytest.raises(
+            ValueError, match=r"`deviation` must have shape .* each entry of `true`"
+        ):
             plot_recovery(self.TRUE, self.TRUE, deviation=np.ones(3))
         with pytest.raises(ValueError, match="at least one parameter"):
             plot_recovery(np.ones(0), np.ones(0))
