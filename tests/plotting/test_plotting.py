@@ -102,7 +102,7 @@ class TestPolygons:
         # The missing area of an inscribed polygon decreases with the square of the number of pieces.
         assert off[0] > 10 * off[1]
         assert off[1] == pytest.approx(64 * off[2], rel=0.1)
-        with pytest.raises(ValueError, match="`points_per_arc` must be a positive whole number"):
+        with pytest.raises(ValueError, match="`points_per_arc` must be at least 1"):
             cell_polygons(tissue, points_per_arc=0)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vertax._base.checks import check_number
+from vertax._base.checks import check_integer
 from vertax._base.indexing import take
 from vertax.mesh._boundary import Periodic
 from vertax.mesh._padding import pad
@@ -146,7 +146,7 @@ def cell_polygons(
 
     - `ValueError` if `points_per_arc` is not positive.
     """
-    check_number("points_per_arc", points_per_arc, at_least=1)
+    check_integer("points_per_arc", points_per_arc, at_least=1)
     return Drawing(tissue, points_per_arc).polygons()
 
 
