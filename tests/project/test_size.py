@@ -32,7 +32,7 @@ LINES = {
     "solvers": 2205,
     "surfaces": 629,
     "tensions": 4191,
-    "tests": 31913,
+    "tests": 31915,
     "transitions": 1578,
 }
 # Largest number of lines of a file, and of the files that have more.
