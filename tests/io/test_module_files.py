@@ -167,6 +167,13 @@ class TestRoundTrip:
         save(path, Anything(value))
         assert same(load(path, vx.AbstractEnergy, classes=[Anything]), Anything(value))
 
+    def test_networks_are_saved_with_their_functions(self, path):
+        network = eqx.nn.MLP(1, 1, 4, 2, jax.nn.softplus, key=jax.random.key(0))
+        save(path, Anything(network))
+        loaded = load(path, Anything, classes=[Anything, eqx.nn.MLP, eqx.nn.Linear])
+        assert loaded.value.activation is jax.nn.softplus
+        assert same(loaded, Anything(network))
+
     @pytest.mark.parametrize("boundary", ["periodic", "free"])
     @pytest.mark.parametrize("precision", ["float32", "float64"])
     def test_problems(self, path, tissues, boundary, precision):

@@ -16,7 +16,7 @@ LINES = {
     "dynamics": 1003,
     "energies": 660,
     "external": 2038,
-    "fitting": 2018,
+    "fitting": 2019,
     "growth": 817,
     "inference": 2274,
     "initialise": 3785,
@@ -32,13 +32,13 @@ LINES = {
     "solvers": 2205,
     "surfaces": 629,
     "tensions": 4191,
-    "tests": 31915,
+    "tests": 31922,
     "transitions": 1578,
 }
 # Largest number of lines of a file, and of the files that have more.
 LINES_OF_A_FILE = 400
 LONG_FILES = {
-    "fitting/_inverse.py": 417,
+    "fitting/_inverse.py": 418,
     "initialise/_labels.py": 418,
     "initialise/_polygons.py": 563,
     "io/_module_file.py": 432,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
+from typing_extensions import TypeVar
 
 from vertax._base.announce import announced_jit
 from vertax._base.checks import describe
@@ -32,7 +33,7 @@ from vertax.energies._scales import mean_stiffness, scales_of
 from vertax.mesh import Tissue
 from vertax.relax import AbstractResponse, Equilibrium, Relaxation
 
-Energy = TypeVar("Energy", bound=AbstractEnergy)
+Energy = TypeVar("Energy", bound=AbstractEnergy, default=Any)
 
 
 class Evaluation(eqx.Module):

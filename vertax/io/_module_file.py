@@ -10,33 +10,24 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
 from vertax._base.archive import as_jax, read_archive, write_archive
-from vertax._base.checks import describe
+from vertax._base.checks import check_instance
 from vertax.fitting import InverseProblem
 from vertax.io._trajectory import members_of, parts_of
 from vertax.mesh import Periodic, Tissue, Topology, Trajectory
 
 _VERSION = 1
 
-# The functions that a field may hold, by their names in files.
-_FUNCTIONS: dict[str, Callable] = {
-    "equinox.is_array": eqx.is_array,
-    "equinox.is_array_like": eqx.is_array_like,
-    "equinox.is_inexact_array": eqx.is_inexact_array,
-    "equinox.is_inexact_array_like": eqx.is_inexact_array_like,
-    "optimistix.max_norm": optx.max_norm,
-    "optimistix.rms_norm": optx.rms_norm,
-    "optimistix.two_norm": optx.two_norm,
-}
+# A field may hold functions of these modules, which are stored by their import path.
+_MODULES = ("jax.nn", "jax.numpy", "jax.lax", "equinox", "optimistix", "optax")
 _ODD_FLOATS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -61,9 +52,9 @@ def save(path: str | os.PathLike[str], content: eqx.Module | Trajectory) -> None
     values are `data.values.0` and so on. The file is written atomically: an interrupted save leaves the old
     file, if any, as it was.
 
-    Functions cannot be stored (except the default `trainable` of a problem, and a few of Equinox and
-    Optimistix). So remove a solver such as [`Optax`][vertax.solvers.Optax] before saving, and set it again
-    after loading:
+    Functions are stored by their import path, such as `jax.nn.tanh`, if they are public in `jax.nn`,
+    `jax.numpy`, `jax.lax`, `equinox`, `optimistix` or `optax`. Other functions cannot be stored: remove a
+    solver such as [`Optax`][vertax.solvers.Optax] before saving, and set it again after loading:
 
     ```python
     vx.save("problem.npz", dataclasses.replace(problem, response=vx.Relaxation()))
@@ -88,11 +79,8 @@ def save(path: str | os.PathLike[str], content: eqx.Module | Trajectory) -> None
         trajectory without frames.
     - `OSError` if the file cannot be written.
     """
-    if not isinstance(content, eqx.Module | Trajectory):
-        raise TypeError(
-            "Argument `content` must be a tissue, an energy, a problem, a trajectory or another "
-            f"equinox.Module, but is {describe(content)}."
-        )
+    expected = "a tissue, an energy, a problem, a trajectory or another equinox.Module"
+    check_instance("content", content, eqx.Module | Trajectory, expected)
     writer = _Writer(content)
     tree = json.dumps(writer.node(content, ""), allow_nan=False)
     write_archive(path, "data", _VERSION, {"tree": np.asarray(tree)} | writer.arrays)
@@ -132,21 +120,11 @@ def load(
         is rounded silently: enable `jax_enable_x64`).
     """
     name = os.fspath(path)
-    if not isinstance(kind, type):
-        raise TypeError(
-            f"Argument `kind` must be a class, such as vx.Tissue, but is {describe(kind)}."
-        )
+    check_instance("kind", kind, type, "a class, such as vx.Tissue")
     user_classes: dict[str, type[eqx.Module]] = {}
-    if isinstance(classes, type) or not isinstance(classes, Iterable):
-        raise TypeError(
-            f"Argument `classes` must be a list of classes, but is {describe(classes)}."
-        )
+    check_instance("classes", classes, Iterable, "a list of classes")
     for cls in classes:
-        if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
-            raise TypeError(
-                "Argument `classes` must hold classes, subclasses of equinox.Module, but holds "
-                f"{describe(cls)}."
-            )
+        check_instance("classes", cls, type(eqx.Module), "a list of subclasses of equinox.Module")
         if user_classes.setdefault(cls.__name__, cls) is not cls:
             raise ValueError(
                 f"Argument `classes` holds two classes of the name {cls.__name__}, which a file cannot "
@@ -164,6 +142,25 @@ def load(
             f"base class, but is {kind.__name__}."
         )
     return content
+
+
+def _import_path(function: Any) -> str | None:
+    """The import path of a function of `_MODULES`; None for other objects."""
+    name = getattr(function, "__name__", "")
+    paths = [f"{module}.{name}" for module in _MODULES]
+    return next((path for path in paths if function is _function_at(path)), None)
+
+
+def _function_at(path: str) -> Any:
+    """The object at an import path of `_MODULES`, or None."""
+    module, _, name = path.rpartition(".")
+    return getattr(importlib.import_module(module), name, None) if module in _MODULES else None
+
+
+def _default_of(cls: type, name: str) -> Any:
+    """The default of a parameter of a class; `inspect.Parameter.empty` without one."""
+    parameter = inspect.signature(cls).parameters.get(name)
+    return inspect.Parameter.empty if parameter is None else parameter.default
 
 
 def _name_of(cls: type) -> str | None:
@@ -222,9 +219,8 @@ class _Writer:
             parts = self.node(parts_of(value), f"{path}.parts")
             values = self.node(value.values, f"{path}.values")
             return {"kind": "trajectory", "parts": parts, "values": values}
-        for name, function in _FUNCTIONS.items():
-            if value is function:
-                return {"kind": "function", "name": name}
+        if (name := _import_path(value)) is not None:
+            return {"kind": "function", "name": name}
         what = "a function" if inspect.isroutine(value) else f"of type {type(value).__name__}"
         raise ValueError(
             f"Argument `content` cannot be saved: its `{path[1:]}` is {what}, which has no place "
@@ -264,6 +260,8 @@ class _Writer:
             )
         held = vars(module)
         names = [field.name for field in dataclasses.fields(cls) if field.name in held]
+        # A function that is a default (`final_activation` of equinox.nn.MLP) is left out.
+        names = [x for x in names if not callable(held[x]) or held[x] is not _default_of(cls, x)]
         fields = {field: self.node(held[field], f"{path}.{field}") for field in names}
         kind, name = ("own", cls.__name__) if name is None else ("vertax", name)
         return {"kind": kind, "class": name, "fields": fields}
@@ -302,8 +300,8 @@ class _Reader:
                 return self.array(name)
             case {"kind": "scalar", "name": str(name)}:
                 return self.array(name)[()]
-            case {"kind": "function", "name": str(name)} if name in _FUNCTIONS:
-                return _FUNCTIONS[name]
+            case {"kind": "function", "name": str(name)} if callable(_function_at(name)):
+                return _function_at(name)
             case {"kind": "trajectory", "parts": parts, "values": values}:
                 values = self.node(values, f"{path}.values")
                 return self.trajectory(self.node(parts, f"{path}.parts"), values)
@@ -369,6 +367,8 @@ class _Reader:
             return convert(field.default)
         if field.default_factory is not dataclasses.MISSING:
             return convert(field.default_factory())
+        if (default := _default_of(cls, field.name)) is not inspect.Parameter.empty:
+            return default
         raise ValueError(
             f"{self.file} has no field `{field.name}` (at `{path}`) of the class {cls.__name__}, which has "
             "no default: it was written with another version of that class."
