@@ -92,7 +92,7 @@ def test_tensions_of_a_segmentation_on_a_surface_are_those_of_its_mask(mask):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"height": np.ones((4, 5))}, ValueError, r"`height` must have the shape of the mask"),
+        ({"height": np.ones((4, 5))}, ValueError, r"`height` must have shape \(120, 120\)"),
         ({"height": np.full((N, N), np.nan)}, ValueError, "must have valid pixels"),
         ({"height": np.ones((N, N)), "inner_arcs": True}, ValueError, "straight chords"),
         ({"height": np.ones((N, N)), "plane_distance": 0.0}, ValueError, "`plane_distance`"),

@@ -172,7 +172,7 @@ def test_areas_of_a_real_epithelium_are_the_published_ones():
 @pytest.mark.parametrize(
     ("height", "error", "message"),
     [
-        (np.ones((4, 5)), ValueError, r"`height` must have the shape of the mask, \(60, 60\)"),
+        (np.ones((4, 5)), ValueError, r"`height` must have shape \(60, 60\)"),
         (np.full((60, 60), np.nan), ValueError, "must have valid pixels"),
         (np.full((60, 60), np.inf), ValueError, "must be finite"),
         (np.full((60, 60), "a"), TypeError, "must hold real numbers"),

@@ -37,7 +37,7 @@ def surface_of(
     check_number("plane_distance", plane_distance, above=0)
     heights, tissue = np.asarray(height), source.tissue
     check_shape(
-        "height", heights, source.image_shape, remedy="Pass the heights of the same pixels."
+        "height", heights, source.image_shape, remedy="Pass the height of each pixel of the mask."
     )
     pixel = pixel_length(source.pixel_size)
     stepped = len(np.unique(heights)) < _STEPS * heights.size
