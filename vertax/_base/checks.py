@@ -102,9 +102,8 @@ def check_instance(name: str, value: Any, kind: Any, expected: str, remedy: str 
     - `remedy`: a last sentence of the message.
     """
     if not isinstance(value, kind):
-        raise TypeError(
-            f"Argument `{name}` must be {expected}, but is {describe(value)}. {remedy}".rstrip()
-        )
+        fact = f"Argument `{name}` must be {expected}, but is {describe(value)}."
+        raise TypeError(f"{fact} {remedy}".rstrip())
 
 
 def check_function(name: str, value: Any, expected: str, remedy: str = "") -> None:
@@ -215,9 +214,8 @@ def as_list(name: str, value: ArrayLike | Sequence[Any]) -> Float[Array, " numbe
     """Convert a list of at least one real number to a JAX array; a `ValueError` for any other shape."""
     numbers = as_real(name, value)
     if numbers.ndim != 1 or numbers.size == 0:
-        raise ValueError(
-            f"Argument `{name}` must be a list of numbers, but its shape is {numbers.shape}."
-        )
+        fact = f"Argument `{name}` must be a list of numbers, but its shape is {numbers.shape}."
+        raise ValueError(fact)
     return numbers
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 
-def cross(p: Float[Array, "*n 2"], q: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
-    """Cross product of vectors in the plane."""
+def cross(p: Shaped[Any, "*n 2"], q: Shaped[Any, "*n 2"]) -> Shaped[Any, "*n"]:
+    """Cross product of vectors in the plane, of JAX or NumPy."""
     return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
 
 

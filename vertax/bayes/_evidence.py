@@ -13,9 +13,8 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from vertax._base.announce import announce_compilations, announced_jit
-from vertax._base.checks import as_key, check_integer
+from vertax._base.checks import as_key, check_instance, check_integer
 from vertax.bayes._laplace import Laplace
-from vertax.bayes._log_posterior import check_instance
 
 # Standard deviation of the first particles in units of the Laplace approximation: wider, because weights
 # cannot correct tails without particles.
@@ -52,7 +51,7 @@ def evidence(
     - `ValueError` for fewer than 2 particles or 1 move.
     - `RuntimeError` if the particles do not reach the posterior.
     """
-    check_instance("laplace", laplace, Laplace)
+    check_instance("laplace", laplace, Laplace, "a vertax.bayes.Laplace")
     check_integer("particles", particles, at_least=2)
     check_integer("moves", moves, at_least=1)
     keys = jax.random.split(as_key(key), _MAX_TEMPERATURES + 1)

@@ -13,8 +13,8 @@ import scipy.optimize
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vertax._base.announce import announced_jit
-from vertax._base.checks import as_key
-from vertax.bayes._log_posterior import LogPosterior, Outcome, Parameters, check_instance
+from vertax._base.checks import as_key, check_instance
+from vertax.bayes._log_posterior import LogPosterior, Outcome, Parameters
 
 
 class Laplace(eqx.Module):
@@ -52,7 +52,7 @@ class Laplace(eqx.Module):
     """Evaluations of the gradient."""
 
     def __init__(self, log_posterior: LogPosterior, start: Parameters | None = None):
-        check_instance("log_posterior", log_posterior, LogPosterior)
+        check_instance("log_posterior", log_posterior, LogPosterior, "a vertax.bayes.LogPosterior")
         z = log_posterior.start() if start is None else log_posterior.coordinates_of(start)
         first = evaluate(log_posterior, z)
         if not np.isfinite(first.log_density):

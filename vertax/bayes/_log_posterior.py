@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from numpyro.distributions import Distribution, Normal
 from numpyro.distributions.transforms import biject_to
 
-from vertax._base.checks import check_number, describe
+from vertax._base.checks import check_instance, check_number, describe
 from vertax._base.results import RESULTS
 from vertax._base.tracing import is_concrete, traced
 from vertax.dynamics import Evolution
@@ -104,7 +104,7 @@ class LogPosterior(eqx.Module):
         energy: Callable[[Parameters], Any] | None = None,
         across_t1: bool = False,
     ):
-        check_instance("problem", problem, InverseProblem)
+        check_instance("problem", problem, InverseProblem, "a vertax.fitting.InverseProblem")
         if not isinstance(prior, Mapping) or not prior:
             raise TypeError(
                 "Argument `prior` must hold distributions by name, e.g. "
@@ -319,13 +319,6 @@ def _expanded(
             )
         expanded[name] = distribution
     return expanded
-
-
-def check_instance(name: str, value: Any, kind: type) -> None:
-    """Raise a `TypeError` for a value of another class of vertax."""
-    if not isinstance(value, kind):
-        full_name = f"{kind.__module__.partition('._')[0]}.{kind.__name__}"
-        raise TypeError(f"Argument `{name}` must be a {full_name}, but is {describe(value)}.")
 
 
 def _check_proper(name: str, distribution: Any) -> None:

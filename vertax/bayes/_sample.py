@@ -27,12 +27,12 @@ from vertax._base.checkpoints import (
     digest,
     layout,
 )
-from vertax._base.checks import as_key, check_integer
+from vertax._base.checks import as_key, check_instance, check_integer
 from vertax._base.fingerprint import fingerprint
 from vertax._base.sequential_vmap import sequential_vmap_on_cpu
 from vertax._base.tracing import tree_where
 from vertax.bayes._laplace import Laplace, evaluate
-from vertax.bayes._log_posterior import LogPosterior, Parameters, check_instance
+from vertax.bayes._log_posterior import LogPosterior, Parameters
 from vertax.bayes._posterior import Posterior
 
 _CHUNK = 20
@@ -96,7 +96,7 @@ def sample(
     - `ValueError` for a number below 1 (`warmup` below 20), a checkpoint of another run, and as
         [`Laplace`][vertax.bayes.Laplace].
     """
-    check_instance("log_posterior", log_posterior, LogPosterior)
+    check_instance("log_posterior", log_posterior, LogPosterior, "a vertax.bayes.LogPosterior")
     for name, value, least in (("draws", draws, 1), ("warmup", warmup, 20), ("chains", chains, 1)):
         check_integer(name, value, at_least=least)
     key = as_key(key)

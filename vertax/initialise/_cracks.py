@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vertax.initialise._nearby_corners import cross
+from vertax._base.plane import cross
 from vertax.initialise._pieces import components
 from vertax.initialise._spatial_order import spatial_order
 

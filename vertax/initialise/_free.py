@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from vertax._base.checks import as_key, check_concrete, check_integer
-from vertax.initialise._nearby_corners import cross
+from vertax._base.plane import cross
 from vertax.initialise._overlap_repair import repair_overlaps
 from vertax.initialise._spatial_order import spatial_order
 from vertax.initialise._voronoi import tessellate

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from vertax._base.plane import cross
 from vertax.initialise._pieces import components
 
 _Result = TypeVar("_Result")
@@ -128,11 +129,6 @@ def areas_and_centroids(
         middle = swept @ (rest + following) / (6 * areas[-1]) if areas[-1] else rest.mean(axis=0)
         centroids.append(ring[0] + middle)
     return np.array(areas), np.array(centroids)
-
-
-def cross(p: Shaped[np.ndarray, "n 2"], q: Shaped[np.ndarray, "n 2"]) -> Shaped[np.ndarray, " n"]:
-    """Cross products of vectors in the plane."""
-    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
 
 
 def _merged(

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from vertax._base.checks import as_float64, as_lattice, check_concrete, check_number, describe
+from vertax._base.plane import cross
 from vertax.initialise._faces import FaceMesh, Names, Sides, build_faces
-from vertax.initialise._nearby_corners import build_within, cross, share_corners, size_of_cells
+from vertax.initialise._nearby_corners import build_within, share_corners, size_of_cells
 from vertax.initialise._overlap_repair import crossed_by, repair_overlaps
 from vertax.mesh import Free, Periodic, Tissue, angle_of_area, geometry_of
 from vertax.surfaces import HeightMap
@@ -147,8 +148,7 @@ def tissue_from_near_corners(
     check_concrete("from_polygons", points, box, tolerance)
     if tolerance is not None:
         check_number("tolerance", tolerance, at_least=0)
-    given = _checked_points(points, names)
-    position = given[:, :2]
+    given, position = _checked_points(points, names)
     corners = _checked_cells(cells, position, names)
     lattice = _checked_box(box, images)
     image = corner_images(images, corners, position, lattice, names)
@@ -212,8 +212,7 @@ def tissue_from_corners(
 ) -> PolygonTissue:
     """`from_polygons` without `tolerance`, with other names for points and cells in messages."""
     check_concrete("from_polygons", points, box, open_cells, softening)
-    given_points = _checked_points(points, names)
-    position = given_points[:, :2]
+    in_space, position = _checked_points(points, names)
     corners = _checked_cells(cells, position, names)
     lattice = _checked_box(box, images)
     is_open = _checked_open(open_cells, len(corners))
@@ -288,7 +287,7 @@ def tissue_from_corners(
         split_points=np.flatnonzero(mesh.degree > 3),
         flattened_edges=np.zeros(topology.n_edges, bool),
     )
-    return _on_surface(_without_overlaps(result, of_kept), given_points, names)
+    return _on_surface(_without_overlaps(result, of_kept), in_space, names)
 
 
 def _without_overlaps(result: PolygonTissue, names: Names) -> PolygonTissue:
@@ -346,8 +345,8 @@ def _check_crossings(
 
 def _checked_points(
     points: ArrayLike | Sequence[Any], names: Names
-) -> Float[np.ndarray, "points dimensions"]:
-    """Positions with two or three coordinates."""
+) -> tuple[Float[np.ndarray, "points dimensions"], Float[np.ndarray, "points 2"]]:
+    """Positions with two or three coordinates, and the first two of them."""
     array: Shaped[Any, "..."] = np.asarray(points)
     if array.ndim == 2 and array.dtype.kind == "f" and not np.isfinite(array).all():
         bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
@@ -360,7 +359,7 @@ def _checked_points(
         raise ValueError(
             f"Argument `points` must have shape (points, 2), but has {position.shape}."
         )
-    return position
+    return position, position[:, :2]
 
 
 def _checked_cells(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from vertax._base.checks import check_shape, describe
-from vertax._base.plane import inverse_of
+from vertax._base.plane import cross, inverse_of
 from vertax._base.tracing import is_concrete
 
 
@@ -186,7 +186,7 @@ class Free(AbstractBoundary):
         displacement = vertices - reference
         centre, rotates = _pivot(reference, pinned)
         arm = reference - centre
-        turn = jnp.sum(_cross(arm, displacement)) / jnp.sqrt(jnp.sum(arm**2))
+        turn = jnp.sum(cross(arm, displacement)) / jnp.sqrt(jnp.sum(arm**2))
         turn = jnp.where(rotates, turn, 0)
         return jnp.append(_translation_drift(displacement, pinned), turn)
 
@@ -198,7 +198,7 @@ class Free(AbstractBoundary):
     ) -> Float[Array, "vertices 2"]:
         (centre, rotates), (pivot, _) = _pivot(reference, pinned), _pivot(vertices, pinned)
         arm, moved = reference - centre, vertices - pivot
-        turn = jnp.arctan2(jnp.sum(_cross(moved, arm)), jnp.sum(moved * arm))
+        turn = jnp.arctan2(jnp.sum(cross(moved, arm)), jnp.sum(moved * arm))
         return jnp.where(rotates, centre + _rotated(moved, turn), vertices)
 
     def motions(
@@ -235,10 +235,6 @@ def _rotated(p: Float[Array, "n 2"], angle: Float[Array, ""]) -> Float[Array, "n
     """Vectors rotated counter-clockwise."""
     perpendicular = jnp.stack([-p[:, 1], p[:, 0]], axis=-1)
     return jnp.cos(angle) * p + jnp.sin(angle) * perpendicular
-
-
-def _cross(p: Float[Array, "n 2"], q: Float[Array, "n 2"]) -> Float[Array, " n"]:
-    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
 
 
 def _translation_drift(
